@@ -60,7 +60,7 @@ class CurveProof:
     """
 
     def __init__(self, kernel: Kernel) -> None:
-        """Make room for proofs of a kernel's robot."""
+        """Allocate buffers for proofs of a kernel's robot."""
         self.robot = kernel.robot
         self._state: curve_proof.ProofBuffers
         integers, floats, self._state = new_buffers(curve_proof.ProofBuffers, dof=kernel.robot.dof)
@@ -116,5 +116,5 @@ class CurveProof:
 
     @property
     def intervals(self) -> int:
-        """Number of intervals looked at."""
+        """Number of intervals examined."""
         return int(self._state.places[2])

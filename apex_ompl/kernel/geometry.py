@@ -95,7 +95,7 @@ class EnclosingSurface(NamedTuple):
 
 
 def surface_distances(points: Array, tree: BallTree, limit: float) -> Array:
-    """Return the distances of points, shape (N, 3) [m], from the nearest triangle, at most ``limit``, shape (N,) [m]."""
+    """Return the distances of points, shape (N, 3) [m], from the nearest triangle, at most a limit, shape (N,) [m]."""
     distances, stack = np.empty(len(points)), np.empty(STACK, np.int64)
     corners, balls, _, child, leaf = tree
     triangles.surface_distances(
@@ -184,7 +184,7 @@ def column_boxes(corners: Array, low: Array, width: Array, pad: float, columns: 
 def farthest_points(directions: Array, points: Array, first: Integers, middles: Array, half: float) -> Integers:
     """Return the number of the point that is farthest in each direction, shape (D,).
 
-    Of points in cells only those in cells that may hold it are looked at.
+    Of points in cells only those in cells that may hold it are examined.
 
     Args:
         directions: Shape (D, 3).

@@ -80,7 +80,7 @@ def _compile(group: Group, shares: list[list[str]]) -> None:
 
 @contextmanager
 def _beside(names: list[str], bar: Any, seconds: Mapping[str, int]) -> Iterator[None]:
-    """Let a process compile functions during a block, and wait for it behind; it ends with the block's exception."""
+    """Let a process compile functions during a block, then wait for it; it ends with the block's exception."""
     command = [*this_python(), "-c", CHILD, *names]
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with subprocess.Popen(

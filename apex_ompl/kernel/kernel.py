@@ -176,7 +176,7 @@ class Kernel:
 
 
 class PathCounts(NamedTuple):
-    """What the check of a path looked at.
+    """Counts of the check of a path.
 
     Attributes:
         proved: States that were proved free.
@@ -198,12 +198,12 @@ class PathCheck:
 
     Attributes:
         robot: The robot that it was made for.
-        state: The state that was looked at last, shape (dof,).
+        state: The state that was examined last, shape (dof,).
         pairs: Pairs that are not proved there, shape (MOST_PAIRS, 2): two bodies, or a body and -1 - obstacle.
     """
 
     def __init__(self, kernel: Kernel) -> None:
-        """Make room for checks of a kernel's robot."""
+        """Allocate buffers for checks of a kernel's robot."""
         self.robot = kernel.robot
         self._workspace = kernel.workspace()
         self._states = np.empty((1, kernel.robot.dof))
@@ -257,5 +257,5 @@ class PathCheck:
 
     @property
     def counts(self) -> PathCounts:
-        """What the check looked at so far."""
+        """Counts so far."""
         return PathCounts(*self._counts.tolist())

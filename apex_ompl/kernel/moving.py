@@ -57,7 +57,7 @@ class OpenMoment(NamedTuple):
         time: Time of the motion [s]; infinite where all of it is proved.
         body: Row of the body that is not proved apart, -1 for none.
         dynamic_obstacle: Number of the dynamic obstacle.
-        intervals: Number of intervals of time looked at.
+        intervals: Number of intervals of time examined.
     """
 
     time: float
@@ -67,23 +67,23 @@ class OpenMoment(NamedTuple):
 
 
 def first_conflict(
-    kernel: Kernel, dynamic: Packed, curve: CurveArrays, begin: float, end: float, clock: float, shortest: float
+    kernel: Kernel, dynamic: Packed, curve: CurveArrays, start: float, end: float, clock: float, shortest: float
 ) -> OpenMoment:
     """Prove by the sphere cover that a motion stays apart from dynamic obstacles, up to the first open moment.
 
     Args:
-        kernel: The robot; its scene is not looked at.
+        kernel: The robot; its scene is ignored.
         dynamic: The obstacles.
         curve: The cubic pieces of the motion; after its end the robot stands still.
-        begin: Where on the motion to start [s].
+        start: Where on the motion to start [s].
         end: Where to end [s].
         clock: Time of the obstacles' stamps when the motion is at 0 [s].
-        shortest: Length of an interval of time that is not divided any more [s].
+        shortest: Length of an interval of time that is not divided further [s].
     """
     found = np.empty(3, np.int64)
     time = dynamic_obstacles.first_conflict(
         *kernel.robot.packed, *dynamic, *kernel.workspace(), curve.knots, curve.states, curve.rates, curve.slack,
-        float(begin), float(end), float(clock), float(shortest), _places(dynamic), np.empty(kernel.robot.dof), found,
+        float(start), float(end), float(clock), float(shortest), _places(dynamic), np.empty(kernel.robot.dof), found,
     )  # fmt: skip
     return OpenMoment(float(time), *found.tolist())
 
@@ -94,7 +94,7 @@ def clearances_in_time(
     """Return the signed clearances of the sphere cover to dynamic obstacles, and their gradients.
 
     Args:
-        kernel: The robot; its scene is not looked at.
+        kernel: The robot; its scene is ignored.
         dynamic: The obstacles.
         states: Shape (N, dof).
         times: Times of the obstacles' stamps, shape (N,) [s].
@@ -117,21 +117,21 @@ def blocked_intervals(
     """Find the times at which dynamic obstacles block pieces of a path, by the sphere cover: never too short.
 
     Args:
-        kernel: The robot; its scene is not looked at.
+        kernel: The robot; its scene is ignored.
         dynamic: The obstacles.
         curve: The path.
         places: Parameters of the starts and ends of the pieces in order, shape (P, 2); the same twice for one state.
-        window: First and last time that are looked at, of the obstacles' stamps [s].
+        window: First and last time that are examined, of the obstacles' stamps [s].
         slack: Distance from the path, of each joint, within which states count as being on it [rad].
 
     Returns:
         The intervals of each piece in order, shape (P, most, 2) [s], and their numbers, shape (P,).
     """
     spans = np.zeros((len(places), compiled_intervals.MOST_SPANS, 2))
-    counts, (begin, end) = np.empty(len(places), np.int64), window
+    counts, (start, end) = np.empty(len(places), np.int64), window
     compiled_intervals.blocked_intervals(
         *kernel.robot.packed, *dynamic, *kernel.workspace(), curve.knots, curve.states, curve.rates,
-        curve.slack + slack, places, float(begin), float(end), np.empty(kernel.robot.dof), spans, counts,
+        curve.slack + slack, places, float(start), float(end), np.empty(kernel.robot.dof), spans, counts,
     )  # fmt: skip
     return spans, counts
 
@@ -145,7 +145,7 @@ def stop_joints(
         position: Shape (dof,) [rad].
         velocity: Shape (dof,) [rad/s].
         acceleration: Shape (dof,) [rad/s^2].
-        limits: Limits; that of velocity is not looked at.
+        limits: Limits; that of velocity is ignored.
 
     Returns:
         Times at which the jerk of any joint changes, shape (K,) [s], positions, velocities and accelerations at them,
@@ -162,14 +162,14 @@ def stop_joints(
 
 
 def stop_on_path(
-    times: Array, states: Array, begin: float, limits: LimitArrays, deviation: float
+    times: Array, states: Array, time: float, limits: LimitArrays, deviation: float
 ) -> tuple[Array, Array, float] | None:
     """Find the soonest stop along the path of a motion that ends at rest; None where none ends before the motion.
 
     Args:
         times: Times of the motion, shape (K,) [s].
         states: Positions, velocities and accelerations at them, shape (3, K, dof).
-        begin: Time from which it stops [s].
+        time: Time from which it stops [s].
         limits: Limits of the stop.
         deviation: Largest distance of any joint from the path [rad].
 
@@ -181,7 +181,7 @@ def stop_on_path(
     start, control, work = np.empty((3, dof)), np.empty((stops.MOST_STEPS + 4, dof)), np.empty((2, dof))
     made, knots = np.empty(room), np.empty((3, room, dof))
     count = stops.stop_on_path(
-        compact(times), states, begin, start, *limits, deviation, control, *work, made, knots
+        compact(times), states, time, start, *limits, deviation, control, *work, made, knots
     )  # fmt: skip
     return (made[:count], knots[:, :count], float(work[1].max())) if count else None
 
@@ -200,7 +200,7 @@ class StopSeries(NamedTuple):
         moments: Times of the motion, shape (N,) [s].
         period: Time from a moment to the stop [s].
         clock: Time of the obstacles' stamps when the motion is at 0 [s].
-        shortest: Length of an interval of time that is not divided any more [s].
+        shortest: Length of an interval of time that is not divided further [s].
     """
 
     expected: DynamicArrays
@@ -220,7 +220,7 @@ def first_unproved_stop(kernel: Kernel, series: StopSeries) -> tuple[int, Flags]
     """Return the first moment after which no stop is proved, or the number of moments, and which stops are by joint.
 
     The next period of the motion is proved, then the soonest stop along it, or else that of each joint by itself. What
-    stands still, and the robot itself, are not looked at.
+    stands still, and the robot itself, are ignored.
     """
     s, curve = series, series.curve
     dof, knots, solids = s.states.shape[2], len(curve.knots), len(s.expected.kind)
@@ -271,7 +271,7 @@ class SpeedSearch(NamedTuple):
         own: Level of the motion's own rate, x = 1.
         rests: Whether it starts at rest.
         forced: Number of stages at the start that keep the motion's own rate.
-        begin: Time at the start [s].
+        start: Time at the start [s].
         latest: Last time at the end [s].
         hold: Time for which the end must stay free after the arrival [s].
         pieces: Pieces of a stage.
@@ -288,7 +288,7 @@ class SpeedSearch(NamedTuple):
     own: int
     rests: bool
     forced: int
-    begin: float
+    start: float
     latest: float
     hold: float
     pieces: int
@@ -312,7 +312,7 @@ def earliest_arrivals(search: SpeedSearch) -> tuple[Integers, Array] | None:
 
 
 def profile_places(
-    x: Array, length: float, first: float, profile: tuple[Integers, Array], begin: float, spacing: float, count: int
+    x: Array, length: float, first: float, profile: tuple[Integers, Array], start: float, spacing: float, count: int
 ) -> Array:
     """Return the places of a profile at evenly spaced times, shape (count,) [s].
 
@@ -321,24 +321,24 @@ def profile_places(
         length: Length of a stage [s].
         first: Place of the first point [s].
         profile: Levels and departures of :func:`earliest_arrivals`.
-        begin: First time [s].
+        start: First time [s].
         spacing: Spacing of the times [s].
         count: Number of places.
     """
     places = np.empty(count)
-    speed_profile.profile_places(x, length, first, *profile, begin, spacing, places)
+    speed_profile.profile_places(x, length, first, *profile, start, spacing, places)
     return places
 
 
 def follow_profile(
-    times: Array, states: Array, begin: float, places: Array, spacing: float, limits: LimitArrays
+    times: Array, states: Array, place: float, places: Array, spacing: float, limits: LimitArrays
 ) -> tuple[Array, Array, Array] | None:
     """Make the motion along a path that has the places of a profile, or return None where it breaks a limit.
 
     Args:
         times: The path's own times, shape (K,) [s].
         states: Positions, velocities and accelerations at them, shape (3, K, dof).
-        begin: Place at the start, which is passed at rate 1 or at rest [s].
+        place: Place at the start, which is passed at rate 1 or at rest [s].
         places: Places at evenly spaced times, the last at rest, shape (N + 1,), N > 1 [s].
         spacing: Spacing of these times [s].
         limits: Limits of the motion.
@@ -350,7 +350,7 @@ def follow_profile(
     dof, size = states.shape[2], len(places) + 1
     control, deviation, made, out = np.empty((size + 2, dof)), np.empty(dof), np.empty(size), np.empty((3, size, dof))
     count = speed_profile.follow_profile(
-        compact(times), states, float(begin), places, spacing, *limits, np.empty((3, dof)), control, deviation, made,
+        compact(times), states, float(place), places, spacing, *limits, np.empty((3, dof)), control, deviation, made,
         out,
     )  # fmt: skip
     return (made, out, deviation) if count else None
@@ -376,16 +376,16 @@ class BlockedPlaces(NamedTuple):
     point_counts: Integers
 
 
-def first_blocked(blocked: BlockedPlaces, places: Array, begin: float, spacing: float) -> int:
+def first_blocked(blocked: BlockedPlaces, places: Array, start: float, spacing: float) -> int:
     """Return the first step of a profile in which it may be at a place that is blocked, or -1.
 
     Args:
         blocked: Places and their intervals.
         places: Places of the profile at evenly spaced times, shape (N,) [s].
-        begin: Time of the first [s].
+        start: Time of the first [s].
         spacing: Spacing of the times [s].
     """
-    return int(speed_profile.first_blocked(*blocked, places, float(begin), spacing))
+    return int(speed_profile.first_blocked(*blocked, places, float(start), spacing))
 
 
 class MotionCost(NamedTuple):

@@ -46,7 +46,7 @@ def group_clearances(scene: SceneTables, balls: ArrayLike, limit: float = np.inf
 
     Args:
         scene: The obstacles.
-        balls: Centers and radii, shape (G, C, 1 + M, 4) [m]: C clusters of a group with M balls each, behind a ball
+        balls: Centers and radii, shape (G, C, 1 + M, 4) [m]: C clusters of a group with M balls each, after a ball
             that contains these.
         limit: Larger clearances are given as this [m].
         seen: Which obstacles of the tables count, shape (obstacles,); all by default.

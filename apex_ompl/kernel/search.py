@@ -23,7 +23,7 @@ from apex_ompl.util.arrays import length
 
 AT_ONCE = 256  # random states between two looks at the clock, where steps are 1 rad and longer
 LEAST_STEP = 0.01  # least longest step: one random state may cost as many as there are across the limits [rad]
-ROOM = 1024  # nodes of a tree to begin with
+ROOM = 1024  # first number of nodes of a tree
 NEAR = 0.5  # share of random states that lie around a straight line between a start and a goal
 SPREAD = 2.0  # standard deviation of these from the line, at most [rad]
 GUIDED = 0.4  # share of all random states that lie around guides, where there are any
@@ -34,7 +34,7 @@ RESOLUTION = 0.01  # of the states along shortcuts of such a path [rad, max-norm
 
 
 class SearchCounts(NamedTuple):
-    """What a search looked at.
+    """Counts of a search.
 
     Attributes:
         proved: States that were proved free.
@@ -58,7 +58,7 @@ class SearchBuffers:
     """
 
     def __init__(self, kernel: Kernel, longest: float, resolution: float) -> None:
-        """Make room for motions up to ``longest`` [rad, max-norm] whose states are ``resolution`` apart [rad]."""
+        """Allocate buffers for motions up to ``longest`` [rad, max-norm] whose states are ``resolution`` apart [rad]."""
         dof, steps = kernel.robot.dof, math.ceil(longest / resolution) + 1
         self.workspace = kernel.workspace()
         self._counts: NDArray[np.int64] = np.zeros(5, np.int64)
@@ -68,7 +68,7 @@ class SearchBuffers:
         )  # fmt: skip
 
     def take_counts(self) -> SearchCounts:
-        """Return what was looked at since the last call."""
+        """Return the counts since the last call."""
         c = self._counts.tolist()
         self._counts[:] = 0
         return SearchCounts(c[PROVED_STATES], c[OPEN_STATES], c[TRIED_INTERVALS], c[PROVED_INTERVALS])
@@ -129,7 +129,7 @@ class TreePair:
         return self.size - len(self._starts) - len(self._goals) + self._failed
 
     def take_counts(self) -> SearchCounts:
-        """Return what was looked at since the last call."""
+        """Return the counts since the last call."""
         return self._buffers.take_counts()
 
     def guide(self, states: Array) -> None:
@@ -207,7 +207,7 @@ def shortcut(
     kernel: Kernel, path: Array, draws: int, resolution: float, rng: np.random.Generator,
     stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Array, SearchCounts]:  # fmt: skip
-    """Return a path with the same ends that is no longer, and what was looked at.
+    """Return a path with the same ends that is no longer, and the counts of the search.
 
     First as many corners as possible are left out, then straight motions between two random places along the path take
     the place of what is between them, where the kernel proves them free (Geraerts and Overmars, 2007), and corners are
@@ -250,12 +250,12 @@ class Graph(NamedTuple):
     """A directed graph of N nodes and E edges, sorted by the node that they start at.
 
     Attributes:
-        begins: First edge of each node, shape (N + 1,).
+        first: First edge of each node, shape (N + 1,).
         ends: Node that each edge leads to, shape (E,).
         lengths: Length of each edge, shape (E,) [rad].
     """
 
-    begins: Integers
+    first: Integers
     ends: Integers
     lengths: Array
 
@@ -269,8 +269,8 @@ class GraphSearch:
     """
 
     def __init__(self, graph: Graph) -> None:
-        """Make room for searches of a graph."""
-        nodes, edges = len(graph.begins) - 1, len(graph.ends)
+        """Allocate buffers for searches of a graph."""
+        nodes, edges = len(graph.first) - 1, len(graph.ends)
         self.graph = graph
         self.cost, self.parent = np.empty(nodes), np.empty(nodes, np.int64)
         self._queue = np.empty(nodes + edges), np.empty(nodes + edges, np.int64)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 ROBOT = "i8[::1], f8[::1], "
 WORKSPACE = BUFFERS = ROBOT
-SCENE = MOVERS = ROBOT + "f4[::1], "
+SCENE = DYNAMIC = ROBOT + "f4[::1], "
 TREES = "f8[:, ::1], f8, f8, f8[:, :, ::1], i8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], "
 PROOF = "f8[:, ::1], i8[::1], i8[:, ::1], i8[::1], f8[::1], i8[:, ::1], i8[::1]"
 CURVE = "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, i8"
@@ -123,14 +123,14 @@ PLANS = Group(
 """What every plan needs."""
 
 RUNS = Group(
-    "what runs among moving obstacles need",
+    "what runs among dynamic obstacles need",
     25,
     (
         {
             "moving.motion_optimization.optimize_motion": (
                 ROBOT
                 + SCENE
-                + MOVERS
+                + DYNAMIC
                 + WORKSPACE
                 + f"f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8, i8, f8[:, ::1], {SETTINGS}, "
                 "i8[::1], f8[::1], f8[::1]",
@@ -139,12 +139,12 @@ RUNS = Group(
         },
         {
             "moving.dynamic_obstacles.clearances_in_time": (
-                ROBOT + MOVERS + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
+                ROBOT + DYNAMIC + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
                 2,
             ),
             "moving.dynamic_obstacles.first_conflict": (
                 ROBOT
-                + MOVERS
+                + DYNAMIC
                 + WORKSPACE
                 + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, f8, f8, f8[:, ::1], f8[::1], "
                 "i8[::1]",
@@ -153,13 +153,13 @@ RUNS = Group(
         },
         {
             "moving.blocked_intervals.blocked_intervals": (
-                ROBOT + MOVERS + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8, f8, f8[::1], "
+                ROBOT + DYNAMIC + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8, f8, f8[::1], "
                 "f8[:, :, ::1], i8[::1]",
                 14,
             ),
             "moving.stop_proof.first_unproved_stop": (
                 ROBOT
-                + MOVERS
+                + DYNAMIC
                 + WORKSPACE
                 + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1], f8[:, ::1], f8[:, ::1], f8, "
                 "f8[:, :, ::1], " + 5 * "f8[::1], " + "f8, f8[::1], i8[::1], f8, f8, f8, f8[:, ::1], f8[::1], i8[::1], "
@@ -205,7 +205,7 @@ RUNS = Group(
         },
     ),
 )
-"""What a run of the closed loop needs besides."""
+"""What a run of the closed loop needs in addition."""
 
 OTHERS: Functions = {
     "geometry.cloud_distance.near_mesh": (
@@ -268,7 +268,7 @@ OTHERS: Functions = {
     "moving.state_costs.state_costs": (
         ROBOT
         + SCENE
-        + MOVERS
+        + DYNAMIC
         + WORKSPACE
         + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]",
         6,

@@ -24,7 +24,7 @@ class Workspace(NamedTuple):
         angle: Values of joints that are to be placed [rad], [m].
         cosine: Their cosines.
         sine: Their sines.
-        moving: Whether clusters move: else the bounds below are not looked at.
+        moving: Whether clusters move: else the bounds below are ignored.
         margin: Distance by which pairs that move must be apart [m].
         arc_bound: Bound by lengths of arcs on the displacement of a cluster's spheres, relative to the frames of the
             joints above it [m]; for this and the next two see :mod:`apex_ompl.kernel.compiled.robot.motion_bound`.

@@ -1,7 +1,7 @@
 """The kernel's compiled functions, built ahead of time into one library for each architecture, and checked when loaded.
 
 ``scripts/build_kernel.py`` builds the library from the code that numba makes of :mod:`apex_ompl.kernel.compiled`, for
-processors of level x86-64-v3 (AVX2 and FMA, since 2013) and for 64-bit ARM, and a file beside it says from which
+processors of level x86-64-v3 (AVX2 and FMA, since 2013) and for 64-bit ARM, and a description beside it names their
 sources. Where it does not fit, because the sources were edited, or the processor or the system is another one, or the
 file is damaged, numba compiles the functions when they are needed. ``$APEX_OMPL_KERNEL`` may ask for ``numba``.
 """

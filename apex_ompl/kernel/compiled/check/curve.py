@@ -96,7 +96,7 @@ def set_motion(
         states: States, shape (K, dof).
         rates: Velocities and accelerations side by side, shape (K, 2 dof), or (0, 2 dof) for a polyline.
         slack: What the pieces miss each other by, by rounding, in all.
-        a: Begin of the interval.
+        a: Start of the interval.
         b: Its end.
         middle: State in its middle, shape (dof,).
         w: Buffers of the state.

@@ -1,11 +1,11 @@
 """Proof that a whole curve is free, and its least clearance, by branch and bound.
 
 Intervals of the curve are bisected, breadth first. On each the sphere covers are tried first, for all pairs at once.
-The few pairs that they leave are looked at by their exact shapes
-(:func:`apex_ompl.kernel.compiled.check.pair_distance.pair_bound`); a pair that is not decided goes on to the two halves of
-the interval, alone. Bounds are compared with a margin: 0 for a bare proof; for the least clearance c it is a limit, or
-what was found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than ``touch`` at
-a state in the middle of an interval counts as touching.
+The few pairs that they leave are bounded by their exact shapes
+(:func:`apex_ompl.kernel.compiled.check.pair_distance.pair_bound`); a pair that is not decided goes on to the two halves
+of the interval, alone. Bounds are compared with a margin: 0 for a bare proof; for the least clearance c it is a limit,
+or the least distance found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than
+``touch`` at a state in the middle of an interval counts as touching.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ QUEUE = 1 << 14  # intervals that wait
 MOST_UNPROVED = 2048  # pairs that the spheres leave on one interval
 MANY = 12  # pairs from which a long interval is bisected first
 SHORT = 0.01  # share of the curve below which an interval is not long
-SHORTEST = 1e-11  # share of the curve below which a pair that is still open is given up
+SHORTEST = 1e-11  # share of the curve below which a pair that is still open is not divided further
 ALL = -1  # stands for all pairs
 
 
@@ -37,11 +37,11 @@ class ProofBuffers(NamedTuple):
     """State of a proof between calls.
 
     Attributes:
-        places: First and one behind the last interval in the queue, which goes around; intervals so far.
+        places: First and one after the last interval in the queue, which goes around; intervals so far.
         pairs: Body and other body, or -1 - obstacle; ALL for all pairs; of each interval in the queue.
         found: Pairs that the spheres leave.
         worst: The pair with the least distance found.
-        intervals: Begin and end of each interval in the queue.
+        intervals: Start and end of each interval in the queue.
         figures: Margin, least distance found, where on the curve, and the length that spheres alone proved.
         where: Middle of the last interval.
         state: State in the middle.
@@ -190,8 +190,8 @@ def prove_curve(
 
     Robot, scene and shapes come packed; ``rows`` gives the shape of an obstacle by its number. Then come the buffers of
     a state, of a pair and of the proof, in which the whole curve is the first interval. ``knots``, ``states``,
-    ``rates`` and ``slack`` are the curve, see :func:`apex_ompl.kernel.compiled.check.curve.set_motion`; ``touch`` is the
-    distance that counts as contact [m], ``tolerance`` that of the least clearance [m], 0 for a bare proof.
+    ``rates`` and ``slack`` are the curve, see :func:`.curve.set_motion`; ``touch`` is the distance that counts as
+    contact [m], ``tolerance`` that of the least clearance [m], 0 for a bare proof.
 
     Returns:
         PROVED, MORE, TOUCHING (the pair is in ``worst``), UNDECIDED where an

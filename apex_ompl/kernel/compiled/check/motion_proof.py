@@ -134,7 +134,7 @@ def is_motion_proved(
     t: RobotArrays, s: SceneArrays, w: Workspace, motion: Floats, resolution: float, starts: Integers, queue: Integers,
     ends: Integers, state: Floats, found: Integers, counts: Integers,
 ) -> bool:  # fmt: skip
-    """Whether a straight motion, shape (2, dof), is proved free behind its first state, its last state first.
+    """Whether a straight motion, shape (2, dof), is proved free after its first state, its last state first.
 
     Buffers are those of :func:`prove_path`; a motion of more states than there is room for is not proved.
     """
@@ -163,8 +163,7 @@ def prove_path(
 
     Returns:
         DONE, or the number of the state that is not proved: it is in ``state``, its pairs in ``found`` (K, 2) and
-        their number in ``ends[2]``, as in :func:`apex_ompl.kernel.compiled.check.queries.check_states`. Another call goes on
-        behind it.
+        their number in ``ends[2]``, as in :func:`.queries.check_states`. Another call goes on after it.
     """
     t, s = robot_view(ri, rf), scene_view(si, sf, sg)
     w = workspace_view(t, wi, wf)

@@ -26,13 +26,13 @@ from apex_ompl.kernel.compiled.geometry.shapes import (
 from apex_ompl.kernel.compiled.geometry.triangles import squared_distance
 from apex_ompl.kernel.compiled.layout import Floats
 
-MOST_LEAVES = 16  # pairs of triangles whose motion is looked at
+MOST_LEAVES = 16  # pairs of triangles whose motion is examined
 FAR, FAST = 0.005, 2.0  # distance [m], and displacement relative to it, from which a motion is to be halved at once
 
 
 @inlined
 def _set_guess(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> None:
-    """Set the direction to begin with: from ball to ball, of nodes or, for -1, of whole shapes."""
+    """Set the first direction: from ball to ball, of nodes or, for -1, of whole shapes."""
     for i in range(3):
         a, b = g.ball[0, i], g.ball[1, i]
         if m >= 0:
@@ -144,7 +144,7 @@ def _inner_bound(
         h: The shapes.
         g: The pair, whose pieces are those of the nodes.
         m: Node of side 0, -1 for a convex shape.
-        n: Node of side 1, likewise.
+        n: Node of side 1, -1 for a convex shape.
         apart: Lower bound of the distance of the nodes now less ``arc`` [m].
         arc: Bound on the displacement of either side [m].
         limit: Lower bound that suffices [m].
@@ -188,7 +188,7 @@ def _mesh_bound(
         h: The shapes.
         g: The pair.
         m: Node of side 0, -1 for a convex shape.
-        n: Node of side 1, likewise.
+        n: Node of side 1, -1 for a convex shape.
         arc: Bound on the displacement of either side [m].
         need: Lower bound that suffices [m].
         first_order: Whether bounds during the motion are sought for triangles that are nearer; else the distance now
@@ -235,7 +235,7 @@ def _mesh_bound(
             swap = _nodes_apart(h, g, m, first) < _nodes_apart(h, g, m, first + 1)
             g.nodes[top, 1], g.nodes[top + 1, 1] = (first + 1, first) if swap else (first, first + 1)
             g.nodes[top, 0] = g.nodes[top + 1, 0] = m
-        top += 2  # the nearer one is looked at first
+        top += 2  # the nearer one is examined first
     return bound, least
 
 
@@ -276,7 +276,7 @@ def _pair_bound(f: Frames, h: ShapeArrays, a: int, b: int, g: PairBuffers, need:
     _set_guess(h, g, -1, -1)
     arc = min(g.arc_bound[0], g.arc_bound[1])
     bound = -math.inf
-    if h.depth[b] < math.inf:  # the hull of points that are all over the scene says nothing
+    if h.depth[b] < math.inf:  # the hull of points that are all over the scene is no help
         distance, upper = convex_distance(corners_of(h), g, need + arc)
         if distance - arc >= need:
             return distance - arc, math.inf

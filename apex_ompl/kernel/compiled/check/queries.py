@@ -28,7 +28,7 @@ def check_states(
 ) -> None:  # fmt: skip
     """Find for each state, shape (N, dof), the pairs that are not proved apart.
 
-    ``found`` (N, K, 2) gets the pairs, ``counts`` (N,) their number or what stands for it, see
+    ``found`` (N, K, 2) gets the pairs, ``counts`` (N,) their number or a code in its place, see
     :func:`apex_ompl.kernel.compiled.check.separation.unproved_at_state`.
     """
     t, s = robot_view(ri, rf), scene_view(si, sf, sg)

@@ -2,7 +2,7 @@
 
 From the tip to the root the joints between two shapes form one chain: those of the moving side up to the lowest common
 joint, then those of the other side down to its joint, whose motion counts with the opposite sign. Along this chain the
-bounds are those of :mod:`apex_ompl.kernel.compiled.robot.motion_bound`, of adaptive collision checking (Schwarzer, Saha and
+bounds are those of :mod:`.robot.motion_bound`, of adaptive collision checking (Schwarzer, Saha and
 Latombe 2005) and of Taylor's theorem, for all points of a ball with center c and radius s around the moving shape:
 
     arm_i = |a_i x (c - o_i)| + s + m,
@@ -43,7 +43,7 @@ class Frames(NamedTuple):
 
 @inlined
 def place_shape(f: Frames, h: ShapeArrays, row: int, g: PairBuffers, s: int) -> None:
-    """Place a shape on side ``s``, as the piece that is looked at, with its ball."""
+    """Place a shape on side ``s``, as the piece that is examined, with its ball."""
     j = h.joint[row]
     r, o, a, p, ball = f.rotation[j], f.origin[j], h.rotation[row], h.offset[row], h.ball[row]
     for i in range(3):
@@ -148,8 +148,8 @@ def distance_during_motion(
     along = x * v[0] + y * v[1] + z * v[2]
     u, p, q = y * o[2] - z * o[1], z * o[0] - x * o[2], x * o[1] - y * o[0]  # n x turn
     ahead = middle + along + _least(corners, g, s, x + u, y + p, z + q)
-    behind = middle - along + _least(corners, g, s, x - u, y - p, z - q)
-    return float(min(ahead, behind) - g.remainder[s])
+    backward = middle - along + _least(corners, g, s, x - u, y - p, z - q)
+    return float(min(ahead, backward) - g.remainder[s])
 
 
 @inlined

@@ -1,6 +1,6 @@
 """Proofs by balls that pairs of bodies are apart, at a state or during a motion around it, or that they collide.
 
-A pair is proved apart when the distance of all spheres that still have to be looked at exceeds their radii plus a bound
+A pair is proved apart when the distance of all spheres that still have to be examined exceeds their radii plus a bound
 on their displacement (:mod:`apex_ompl.kernel.compiled.robot.motion_bound`). The cover contains the solids, so that a
 proved pair is free of collision; a pair that is not proved may be either.
 

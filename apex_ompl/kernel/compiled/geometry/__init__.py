@@ -1,1 +1,1 @@
-"""Distances and proofs between shapes, without a robot: primitives, grids, triangles, convex pieces, clouds and trees."""
+"""Distances between shapes, without a robot: primitives, grids, triangles, convex pieces, clouds and trees."""

@@ -60,8 +60,8 @@ def order_items(corners: Floats, low: Floats, extent: float, keys: Integers, cou
         corners: Shape (N, 1 or 3, 3) [m].
         low: Lowest corner of all, shape (3,) [m].
         extent: Longest side of the box around them [m].
-        keys: Room, shape (2, N); N is less than 2^32.
-        counts: Room, shape (2^HALF,).
+        keys: Buffer, shape (2, N); N is less than 2^32.
+        counts: Buffer, shape (2^HALF,).
         items: Gets the corners less ``low``, shape (N, 3 or 9) [m].
     """
     number, last = corners.shape[1], (1 << BITS) - 1
@@ -154,7 +154,7 @@ def items_apart(grid: Integers, values: Singles, a: float, b: float, c: float, r
 
 @inlined
 def _select(centers: Floats, order: Integers, axis: int, first: int, last: int, middle: int) -> None:
-    """Order the items of a range so that those before ``middle`` are not behind it along an axis (quickselect)."""
+    """Order the items of a range so that those before ``middle`` are not after it along an axis (quickselect)."""
     low, high = first, last - 1
     while low < high:
         pivot = centers[order[(low + high) // 2], axis]
@@ -182,7 +182,7 @@ def median_order(centers: Floats, order: Integers, ranges: Integers) -> None:
     Args:
         centers: Places of the items, shape (N, 3).
         order: Numbers of the items, shape (N,).
-        ranges: Room for ranges that wait, shape (n, 2), n longer than twice the depth of the tree.
+        ranges: Buffer for ranges that wait, shape (n, 2), n longer than twice the depth of the tree.
     """
     top = 1
     ranges[0, 0], ranges[0, 1] = 0, len(order)
@@ -211,7 +211,7 @@ def node_balls(corners: Floats, first: Integers, last: Integers, balls: Floats, 
     Args:
         corners: Corners of triangles, or points, shape (T, k, 3) [m].
         first: First triangle of each node, shape (n,).
-        last: The one behind its last, shape (n,).
+        last: The one after its last, shape (n,).
         balls: Gets center and radius, shape (n, 4) [m].
         halves: Gets the half edges of the boxes, shape (n, 3) [m].
     """

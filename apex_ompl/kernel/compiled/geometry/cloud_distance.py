@@ -61,7 +61,7 @@ def near_mesh(
         leaf: Triangle of each leaf.
         pose: Pose of the mesh in the frame of the points, shape (4, 4) [m].
         limit: The distance [m].
-        stack: Room for pairs of nodes, shape (n, 2), n longer than both trees are deep.
+        stack: Buffer for pairs of nodes, shape (n, 2), n longer than both trees are deep.
     """
     top = 1
     stack[0, 0] = stack[0, 1] = 0
@@ -108,7 +108,7 @@ def any_inside(
         normals: Outward unit normals of its convex hull, shape (P, 3).
         offsets: Offsets of its planes, shape (P,) [m].
         pose: Pose of the mesh in the frame of the points, shape (4, 4) [m].
-        stack: Room for nodes, shape (n, 2).
+        stack: Buffer for nodes, shape (n, 2).
     """
     top = 1
     stack[0, 0] = 0
@@ -150,7 +150,7 @@ def near_primitive(
         size: Half edges; radius; or radius and half length, shape (3,) [m].
         pose: Pose of the primitive in the frame of the points, shape (4, 4) [m].
         limit: The distance [m].
-        stack: Room for nodes, shape (n, 2).
+        stack: Buffer for nodes, shape (n, 2).
     """
     top = 1
     stack[0, 0] = 0

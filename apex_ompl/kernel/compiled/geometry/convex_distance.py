@@ -32,7 +32,7 @@ def radius(g: PairBuffers, s: int) -> float:
 def _climb(corners: Corners, g: PairBuffers, s: int, x: float, y: float, z: float) -> int:
     """Return the corner of the hull on side ``s`` that is farthest along a direction in its frame.
 
-    From the corner that was found last, by way of neighbors that are farther: where none is, no corner is.
+    From the corner that was found last, over neighbors that are farther: where none is, no corner is.
     """
     points, first, graph, at = corners.points, g.first[s], g.graph[s], g.at[s]
     best = points[first + at, 0] * x + points[first + at, 1] * y + points[first + at, 2] * z
@@ -178,7 +178,7 @@ def convex_distance(corners: Corners, g: PairBuffers, enough: float) -> tuple[fl
 
     Args:
         corners: Corners of hulls and triangles.
-        g: The pieces; ``normal`` is the direction to begin with.
+        g: The pieces; ``normal`` is the first direction.
         enough: Lower bound that suffices [m].
 
     Returns:
@@ -243,7 +243,7 @@ def farthest_points(
     for k in range(len(directions)):
         x, y, z = directions[k, 0], directions[k, 1], directions[k, 2]
         wide, best = half * (abs(x) + abs(y) + abs(z)), -math.inf
-        for c in range(len(middles)):  # a bound to begin with
+        for c in range(len(middles)):  # a first bound
             n = first[c]
             reach = x * points[n, 0] + y * points[n, 1] + z * points[n, 2]
             if reach > best:

@@ -21,8 +21,8 @@ def raster_triangles(corners: Floats, band: float, squared: Singles) -> None:
 
     Args:
         corners: Corners of the triangles, shape (T, 3, 3).
-        band: Distance up to which nodes are looked at.
-        squared: Squared distances, shape (nx, ny, nz); FAR to begin with.
+        band: Distance up to which nodes are examined.
+        squared: Squared distances, shape (nx, ny, nz); FAR at the start.
     """
     for t in range(len(corners)):
         a, b, c = corners[t, 0], corners[t, 1], corners[t, 2]
@@ -58,7 +58,7 @@ def raster_points(points: Floats, squared: Singles) -> None:
 
     Args:
         points: Shape (N, 3), inside of the grid.
-        squared: Squared distances, shape (nx, ny, nz); FAR to begin with. Those up to 1 are exact afterwards.
+        squared: Squared distances, shape (nx, ny, nz); FAR at the start. Those up to 1 are exact afterwards.
     """
     for n in range(len(points)):
         i, j, k = int(points[n, 0]), int(points[n, 1]), int(points[n, 2])
@@ -107,7 +107,7 @@ def mark_crossings(corners: Floats, turns: Singles) -> None:
 
     Args:
         corners: Corners of the triangles, shape (T, 3, 3).
-        turns: Shape (nx, ny, nz); zeros to begin with.
+        turns: Shape (nx, ny, nz); zeros at the start.
     """
     nx, ny, nz = turns.shape
     for t in range(len(corners)):
@@ -161,9 +161,9 @@ def transform_lines(squared: Singles, axis: int, line: Floats, at: Integers, end
     Args:
         squared: Shape (nx, ny, nz).
         axis: Axis that the lines are along, of n nodes.
-        line: Room, shape (3 n,).
-        at: Room, shape (n,).
-        ends: Room, shape (n,).
+        line: Buffer, shape (3 n,).
+        at: Buffer, shape (n,).
+        ends: Buffer, shape (n,).
     """
     nx, ny, nz = squared.shape
     n = nx if axis == 0 else ny if axis == 1 else nz
@@ -189,7 +189,7 @@ def split_near(squared: Singles, band: float, seed: float, near: Singles) -> Non
         squared: Squared distances, shape (nx, ny, nz); gets 0 where they are at most ``seed``, elsewhere FAR.
         band: Largest distance that is kept.
         seed: Largest squared distance of nodes that others are measured from.
-        near: Gets the distances that are kept, -1 elsewhere, likewise.
+        near: Gets the distances that are kept, -1 elsewhere, shape (nx, ny, nz).
     """
     nx, ny, nz = squared.shape
     for i in range(nx):
@@ -206,7 +206,7 @@ def lower_bounds(squared: Singles, near: Singles, band: float, slack: float, spa
 
     Args:
         squared: Squared distances to the nearest seed, shape (nx, ny, nz).
-        near: Distances that are exact, -1 elsewhere, likewise.
+        near: Distances that are exact, -1 elsewhere, shape (nx, ny, nz).
         band: What distances that are not exact are at least.
         slack: What distances to seeds, and interpolation, are wrong by at most.
         spacing: Of the nodes [m].
@@ -228,7 +228,7 @@ def negate_inside(turns: Singles, values: Singles, band: float, slack: float, sp
 
     Args:
         turns: What :func:`mark_crossings` wrote, shape (nx, ny, nz).
-        values: What :func:`lower_bounds` wrote, likewise.
+        values: What :func:`lower_bounds` wrote, shape (nx, ny, nz) [m].
         band: See there.
         slack: See there.
         spacing: See there [m].
@@ -283,11 +283,11 @@ def tabulate_triangles(
         slack: What distances to these, and interpolation, are wrong by at most [spacings].
         spacing: Of the nodes [m].
         less: What is subtracted from all [m].
-        squared: Room, shape (nx, ny, nz).
-        values: Gets the bounds, likewise.
-        line: Room, shape (3 n,) for the longest axis.
-        at: Room, shape (n,).
-        ends: Room, likewise.
+        squared: Buffer, shape (nx, ny, nz).
+        values: Gets the bounds, shape (nx, ny, nz) [m].
+        line: Buffer, shape (3 n,) for the longest axis.
+        at: Buffer, shape (n,).
+        ends: Buffer, shape (n,).
     """
     _fill(squared, FAR)
     raster_triangles(corners, band, squared)

@@ -73,8 +73,8 @@ def grid_distance(
 def compare(grid: Integers, values: Singles, spacing: float, a: float, b: float, c: float, reach: float) -> int:
     """Compare the distance of a point in the grid's frame from what the grid is about with ``reach`` [m].
 
-    A distance changes by at most the way: the one at the nearest node, before it was lowered, less the way to that node
-    is a bound that mostly is better than the interpolated one, of which it spares the look at the other nodes.
+    A distance function is 1-Lipschitz: its value at the nearest node, before it was lowered, less the distance to that
+    node is a bound. Mostly it is better than the interpolated one, and it needs no look at the other nodes.
 
     Args:
         grid: See :func:`grid_distance`.
@@ -94,10 +94,10 @@ def compare(grid: Integers, values: Singles, spacing: float, a: float, b: float,
     if 0.0 <= x <= nx - 1.0 and 0.0 <= y <= ny - 1.0 and 0.0 <= z <= nz - 1.0:
         i, j, k = int(x + 0.5), int(y + 0.5), int(z + 0.5)
         nearest = values[grid[0] + (i * ny + j) * nz + k]
-        way = math.sqrt((x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2)
-        if nearest + spacing * (SLACK - way) > reach:
+        away = math.sqrt((x - i) ** 2 + (y - j) ** 2 + (z - k) ** 2)
+        if nearest + spacing * (SLACK - away) > reach:
             return FARTHER
-        if nearest + spacing * (LOWERED + way) < reach:
+        if nearest + spacing * (LOWERED + away) < reach:
             return NEARER
     return FARTHER if grid_distance(grid, values, spacing, a, b, c, reach) > reach else OPEN
 

@@ -38,7 +38,7 @@ def label_regions(cells: Integers, stack: Integers) -> int:
     Args:
         cells: FREE or OCCUPIED, shape (nx, ny, nz), with free cells on all sides; gets OUTSIDE, or OCCUPIED and the
             number of the region from 1 on.
-        stack: Room, shape (nx ny nz,).
+        stack: Buffer, shape (nx ny nz,).
     """
     nx, ny, nz = cells.shape
     _flood(cells, 0, 0, 0, FREE, OUTSIDE, stack)
@@ -63,7 +63,7 @@ def add_up(cells: Integers, sums: Integers) -> None:
 
     Args:
         cells: Shape (nx, ny, nz).
-        sums: Shape (nx + 1, ny + 1, nz + 1); zeros to begin with.
+        sums: Shape (nx + 1, ny + 1, nz + 1); zeros at the start.
     """
     nx, ny, nz = cells.shape
     for i in range(nx):
@@ -107,10 +107,10 @@ def best_box(sums: Integers, left: Integers, seeds: Integers, share: float, box:
     Args:
         sums: What :func:`add_up` wrote of all cells that boxes may hold.
         left: Not zero where a cell is in no box yet, shape (nx, ny, nz).
-        seeds: Cells to begin at, shape (N, 3).
+        seeds: Cells to start from, shape (N, 3).
         share: Of a layer of cells, how many must be marked for a box to grow by it.
-        box: Room, shape (2, 3).
-        best: Gets the first cell of the best box and the one behind its last, shape (2, 3).
+        box: Buffer, shape (2, 3).
+        best: Gets the first cell of the best box and the one after its last, shape (2, 3).
     """
     most = 0
     low, high = box[0], box[1]

@@ -142,7 +142,7 @@ def lower_to_distances(s: SceneArrays, o: int, balls: Floats, least: Floats) -> 
 
 @inlined
 def _clearance(s: SceneArrays, seen: Integers, balls: Floats, best: float) -> float:
-    """Return the least signed distance of balls behind one around them, shape (1 + M, 4) [m]; at most ``best``."""
+    """Return the least signed distance of balls that follow one around them, shape (1 + M, 4) [m]; at most ``best``."""
     x, y, z, radius, k = balls[0, 0], balls[0, 1], balls[0, 2], balls[0, 3], 0
     while True:
         k, first, end = next_obstacles(s, x, y, z, max(best, 0.0) + radius, k)
@@ -166,7 +166,7 @@ def group_clearances(
 ) -> None:  # fmt: skip
     """Put the least signed distance of the balls of each group from the obstacles into ``clearances`` (G,) [m].
 
-    Balls of clusters are looked at where the ball around them may be nearer than what was found, the nearest first.
+    Balls of clusters are examined where the ball around them may be nearer than what was found, the nearest first.
 
     Args:
         si: Integers of the scene.
@@ -174,10 +174,10 @@ def group_clearances(
         sg: Singles of the scene.
         seen: Which obstacles count, shape (obstacles,).
         outer: Centers and radii of the balls around clusters, shape (C, 4, G) [m].
-        balls: Centers and radii, shape (G, C, 1 + M, 4) [m]: C clusters of a group with M balls each, behind a ball
+        balls: Centers and radii, shape (G, C, 1 + M, 4) [m]: C clusters of a group with M balls each, after a ball
             that contains these.
         limit: Larger clearances are given as this [m].
-        least: Room, shape (C, G).
+        least: Buffer, shape (C, G).
         clearances: Shape (G,) [m].
     """
     s = scene_view(si, sf, sg)
@@ -269,7 +269,7 @@ def clearances_alone(
         sf: See ``si``.
         sg: See ``si``.
         outer: Balls that contain those of a cluster, shape (C, 4, G) [m].
-        balls: Centers and radii, shape (G, C, 1 + M, 4): M balls of each of C clusters behind the outer one [m].
+        balls: Centers and radii, shape (G, C, 1 + M, 4): M balls of each of C clusters after the outer one [m].
         limit: Larger clearances are given as this [m].
         room: Shape (C, G).
         clearances: Gets the clearances.

@@ -22,7 +22,7 @@ class ShapeArrays(NamedTuple):
     joint's. ``ball`` (in the joint's frame) contains the solid. Hulls have their corners in ``points``.
 
     A mesh that is not convex is a HULL, which bounds its distance, with the root of a binary tree of balls around its
-    triangles in ``root`` (else -1). An inner node has its first child in ``child``, the second stands behind it; a leaf
+    triangles in ``root`` (else -1). An inner node has its first child in ``child``, the second follows it; a leaf
     has -1 there, and the first of its three corners in ``corner``, or POINT less the place of a single point. A hull
     may be that of balls around points, whose radius is its ``size``. Balls of nodes are in the shape's frame, with the
     half edges of the nodes' bounding boxes around the same centers in ``node_half``. Triangles lie at most ``depth``
@@ -72,7 +72,7 @@ class PairBuffers(NamedTuple):
     """Memory for the distance and the relative motion of one pair; rows 0 and 1 are its two sides.
 
     Attributes:
-        kind: Kind of the convex piece that is looked at on a side.
+        kind: Kind of the convex piece that is examined on a side.
         first: First of its points.
         corners: Number of its points.
         graph: Place of the neighbors of its points, -1 where it has none.

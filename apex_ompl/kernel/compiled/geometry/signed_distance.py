@@ -142,10 +142,10 @@ def next_obstacles(s: SceneArrays, x: float, y: float, z: float, radius: float, 
         y: Center of the ball [m].
         z: Center of the ball [m].
         radius: Radius of the ball [m], which may change from call to call; a ball that is not a number meets all.
-        k: Node to begin with: 0, or the one that the call before returned.
+        k: First node: 0, or the one that the call before returned.
 
     Returns:
-        The node to go on with, first obstacle, and the one behind the last; an empty range is the end.
+        The node to go on with, first obstacle, and the one after the last; an empty range is the end.
     """
     nodes, obstacles = len(s.tree_skip), len(s.kind)
     while k < nodes:

@@ -102,7 +102,7 @@ def _passes(y0: float, z0: float, y1: float, z1: float, y: float, z: float) -> i
 
 @inlined
 def _volume(corners: Floats, t: int, x: float, y: float, z: float) -> float:
-    """Return six times the volume of the tetrahedron of a point and a triangle, positive behind the triangle."""
+    """Return six times the signed volume of the tetrahedron of a point and a triangle, positive on its inner side."""
     ax, ay, az = corners[t, 0, 0] - x, corners[t, 0, 1] - y, corners[t, 0, 2] - z
     bx, by, bz = corners[t, 1, 0] - x, corners[t, 1, 1] - y, corners[t, 1, 2] - z
     cx, cy, cz = corners[t, 2, 0] - x, corners[t, 2, 1] - y, corners[t, 2, 2] - z
@@ -217,7 +217,7 @@ def column_boxes(corners: Floats, low: Floats, width: Floats, pad: float, points
         low: Least corner of the surface, shape (3,) [m].
         width: Widths of columns, shape (3,) [m].
         pad: Margin of columns against rounding [m].
-        points: Room for polygons, shape (2, CORNERS, 3).
+        points: Buffer for polygons, shape (2, CORNERS, 3).
         boxes: Boxes of columns, shape (3, C, C, 2, 3) [m]: along which axis, the places along the other two axes in
             ascending order, least and largest corner. Only grown: infinite boxes of the wrong sign are given.
     """

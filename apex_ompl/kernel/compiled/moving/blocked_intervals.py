@@ -140,7 +140,7 @@ def meeting_times(m: DynamicArrays, o: int, x: float, y: float, z: float, radius
         y: The same.
         z: The same.
         radius: Of the ball [m].
-        within: Interval of times, of the dynamic obstacles' stamps, that is looked at [s].
+        within: Interval of times, of the dynamic obstacles' stamps, that is examined [s].
 
     Returns:
         First and last time; the first is after the last where they never meet.
@@ -223,7 +223,7 @@ def _add_place(
 def blocked_intervals(
     ri: Integers, rf: Floats, mi: Integers, mf: Floats, ms: Singles, wi: Integers, wf: Floats,
     knots: Floats, states: Floats, rates: Floats, slack: float, places: Floats,
-    begin: float, end: float, state: Floats, spans: Floats, counts: Integers,
+    start: float, end: float, state: Floats, spans: Floats, counts: Integers,
 ) -> None:  # fmt: skip
     """Find the times at which pieces of a path are blocked.
 
@@ -231,16 +231,16 @@ def blocked_intervals(
         ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
         rf: Robot.
         mi: Dynamic obstacles, packed.
-        mf: DynamicObstacles.
-        ms: DynamicObstacles.
+        mf: Dynamic obstacles.
+        ms: Dynamic obstacles.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
         knots: The path, as are the next two; see :func:`apex_ompl.kernel.compiled.check.curve.set_motion`.
         states: States at the knots.
         rates: Velocities and accelerations at the knots.
         slack: Distance from the path within which states count as being on it, of each joint [rad].
-        places: Parameters of the begins and ends of the pieces, shape (P, 2); the same twice for one state.
-        begin: First time that is looked at, of the dynamic obstacles' stamps [s].
+        places: Parameters of the starts and ends of the pieces, shape (P, 2); the same twice for one state.
+        start: First time that is examined, of the dynamic obstacles' stamps [s].
         end: The last one [s].
         state: Buffer for a state, shape (dof,).
         spans: Gets the blocked intervals of each piece in their order, shape (P, MOST_SPANS, 2) [s].
@@ -248,7 +248,7 @@ def blocked_intervals(
     """
     t, m = robot_view(ri, rf), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
-    within = (begin, end)
+    within = (start, end)
     for p in range(len(places)):
         if p % TOGETHER == 0:
             last = min(p + TOGETHER, len(places)) - 1

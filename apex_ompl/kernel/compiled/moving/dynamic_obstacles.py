@@ -1,4 +1,4 @@
-"""Obstacles that move: where they are in time, the proof of a motion among them, and clearances in time.
+"""Dynamic obstacles: their places in time, the proof of a motion among them, and clearances in time.
 
 Dynamic obstacles stay out of the scene's tree. Dynamic obstacle o has the place p_o at its time stamp s_o, the velocity
 v_o and a margin that may grow: at time t it stands at p_o + v_o (t - s_o), and counts as larger by
@@ -11,7 +11,7 @@ interval, h on either side, a dynamic obstacle's own motion adds to that of the 
 
     min(arc bound + |v_o| h,  |linear - v_o h| + remainder),
 
-to which the margin at the end of the interval is added. Intervals are proved one behind the other, each as long as it
+to which the margin at the end of the interval is added. Intervals are proved one after the other, each as long as it
 can be, so that the first moment that is not proved is the earliest.
 """
 
@@ -53,7 +53,7 @@ class DynamicArrays(NamedTuple):
         place: Where they stand at their time stamps, shape (M, 3) [m].
         velocity: Shape (M, 3) [m/s].
         stamp: Time stamps, shape (M,) [s].
-        growth: Margin at the time stamp [m], and its growth behind it [m/s], shape (M, 2).
+        growth: Margin at the time stamp [m], and its growth after it [m/s], shape (M, 2).
     """
 
     kind: Integers
@@ -148,7 +148,7 @@ def set_interval(
 ) -> bool:  # fmt: skip
     """Place the robot in the middle of an interval and bound its motion; false where the tables do not hold.
 
-    Behind the end of the curve it stands still.
+    After the end of the curve the robot stands still.
     """
     last = knots[len(knots) - 1]
     still = len(knots) == 1 or a >= last
@@ -173,14 +173,14 @@ def set_interval(
 @inlined
 def conflict_on(
     t: RobotArrays, m: DynamicArrays, s: SceneArrays, w: Workspace, knots: Floats, states: Floats, rates: Floats,
-    slack: float, begin: float, end: float, clock: float, shortest: float, offset: Floats, state: Floats,
+    slack: float, start: float, end: float, clock: float, shortest: float, offset: Floats, state: Floats,
     found: Integers,
 ) -> float:  # fmt: skip
     """Return the first moment of a motion that is not proved, see :func:`first_conflict`."""
     last = knots[len(knots) - 1]
     found[0] = found[1] = -1
     found[2] = 0
-    a, step, halved = begin, FIRST, False
+    a, step, halved = start, FIRST, False
     while a < end:
         b = min(a + step, end)
         if a < last < b:
@@ -204,7 +204,7 @@ def conflict_on(
 def first_conflict(
     ri: Integers, rf: Floats, mi: Integers, mf: Floats, ms: Singles, wi: Integers, wf: Floats,
     knots: Floats, states: Floats, rates: Floats, slack: float,
-    begin: float, end: float, clock: float, shortest: float, offset: Floats, state: Floats, found: Integers,
+    start: float, end: float, clock: float, shortest: float, offset: Floats, state: Floats, found: Integers,
 ) -> float:  # fmt: skip
     """Return the first moment of a motion that is not proved apart from the obstacles [s], or infinity.
 
@@ -212,18 +212,18 @@ def first_conflict(
         ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
         rf: Robot.
         mi: Dynamic obstacles, packed.
-        mf: DynamicObstacles.
-        ms: DynamicObstacles.
+        mf: Dynamic obstacles.
+        ms: Dynamic obstacles.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
         knots: Times of the motion, as are the next three; see :func:`apex_ompl.kernel.compiled.check.curve.set_motion`.
         states: States at the knots.
         rates: Velocities and accelerations at the knots.
         slack: What the pieces miss each other by.
-        begin: Where on the motion to begin [s].
-        end: Where to end [s]; behind its last knot the robot stands.
+        start: Where on the motion to start [s].
+        end: Where to end [s]; after its last knot the robot stands still.
         clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
-        shortest: Length of an interval that is given up [s].
+        shortest: Length of an interval that is not divided further [s].
         offset: Buffer for places, shape (M, 3).
         state: Buffer for a state, shape (dof,).
         found: Gets the body and the owner of the dynamic obstacle, shape (2,); then the number of intervals.
@@ -233,7 +233,7 @@ def first_conflict(
     s = scene_of_dynamic(m, offset)
     return float(
         conflict_on(
-            t, m, s, w, knots, states, rates, slack, begin, end, clock, shortest, offset, state, found
+            t, m, s, w, knots, states, rates, slack, start, end, clock, shortest, offset, state, found
         )
     )  # fmt: skip
 

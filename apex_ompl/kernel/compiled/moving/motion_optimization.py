@@ -1,8 +1,8 @@
-"""Levenberg-Marquardt steps on a motion among obstacles that move: the control points of a spline in time.
+"""Levenberg-Marquardt steps on a motion among dynamic obstacles: the control points of a spline in time.
 
-The cost is that of a path (:mod:`apex_ompl.kernel.compiled.path.path_cost`), with clearances to dynamic obstacles where they
-are at the times of the samples, and with what the motion exceeds its limits by. For the uniform cubic B-spline in time
-with knot spacing h, whose k-th differences are D_k P,
+The cost is that of a path (:mod:`apex_ompl.kernel.compiled.path.path_cost`), with clearances to dynamic obstacles at
+the times of the samples, and a term for exceeded limits. For the uniform cubic B-spline in time with knot spacing h,
+whose k-th differences are D_k P,
 
     limits = weight / 2 sum_k sum_i sum_d max(0, |D_k P|_id / (limit_kd h^k) - 1)^2,   k = 1, 2, 3,
 
@@ -41,7 +41,7 @@ WIDTH = ORDERS + 1  # control points that a sample, or a jerk, depends on
 
 
 class MotionProblem(NamedTuple):
-    """What the cost of a motion needs besides robot and scene.
+    """Data of the cost of a motion in addition to robot and scene.
 
     Attributes:
         weights: Weights of control points at the samples, shape (N, 4).

@@ -59,7 +59,7 @@ def push_bounds(
         window: See above [s].
         x: Levels of the squared rate, shape (levels,).
         lowest: Gets the least ones, shape (P, levels) [1/s].
-        highest: Gets the largest, likewise; less than the least where there is none.
+        highest: Gets the largest, shape (P, levels) [1/s]; less than the least where there is none.
     """
     for p in range(lowest.shape[0]):
         for m in range(len(x)):
@@ -68,7 +68,7 @@ def push_bounds(
 
 @inlined
 def _place_after(x: Floats, i: int, j: int, length: float, since: float) -> float:
-    """Return how far along a stage a profile is at a time since its begin."""
+    """Return how far along a stage a profile is at a time since its start."""
     if i == 0 and j == 0:
         push, half = x[1] / length, length / math.sqrt(x[1])
         along = 0.5 * push * since * since if since <= half else length - 0.5 * push * (2.0 * half - since) ** 2
@@ -78,9 +78,9 @@ def _place_after(x: Floats, i: int, j: int, length: float, since: float) -> floa
 
 @entry_point
 def profile_places(
-    x: Floats, length: float, first: float, levels: Integers, departures: Floats, begin: float, h: float, out: Floats
+    x: Floats, length: float, first: float, levels: Integers, departures: Floats, start: float, h: float, out: Floats
 ) -> None:
-    """Put the places of a profile at times ``begin + k h`` into ``out`` (N,).
+    """Put the places of a profile at times ``start + k h`` into ``out`` (N,).
 
     Args:
         x: Levels of the squared rate, shape (levels,).
@@ -88,13 +88,13 @@ def profile_places(
         first: Place of the first point [s].
         levels: Levels at the points, shape (S + 1,).
         departures: Times of arrival at them and of departure, shape (S + 1, 2) [s].
-        begin: First time [s].
+        start: First time [s].
         h: Spacing of the times [s].
         out: Gets the places [s].
     """
     k, last = 0, len(levels) - 1
     for n in range(len(out)):
-        time = begin + n * h
+        time = start + n * h
         while k < last and departures[k + 1, 0] <= time:
             k += 1
         out[n] = first + k * length
@@ -105,7 +105,7 @@ def profile_places(
 
 @entry_point
 def follow_profile(
-    knots: Floats, states: Floats, begin: float, profile: Floats, h: float,
+    knots: Floats, states: Floats, place: float, profile: Floats, h: float,
     lower: Floats, upper: Floats, velocity: Floats, acceleration: Floats, jerk: Floats,
     start: Floats, control: Floats, deviation: Floats, times: Floats, out: Floats,
 ) -> int:  # fmt: skip
@@ -114,16 +114,16 @@ def follow_profile(
     Args:
         knots: The path's own times, shape (K,) [s].
         states: Positions, velocities and accelerations at them, shape (3, K, dof).
-        begin: Place at the start, which is passed at rate 1 or at rest [s].
+        place: Place at the start, which is passed at rate 1 or at rest [s].
         profile: Places at times h apart, the last at rest, shape (N + 1,), N > 1.
         h: Spacing in time [s].
-        lower: Limits, shape (dof,); likewise the next four.
-        upper: Highest positions.
-        velocity: Limits.
-        acceleration: Limits.
-        jerk: Limits.
-        start: Room, shape (3, dof).
-        control: Room, shape (N + 4, dof).
+        lower: Lowest positions, shape (dof,) [rad].
+        upper: Highest positions, shape (dof,) [rad].
+        velocity: Limits of velocity, shape (dof,) [rad/s].
+        acceleration: Limits of acceleration, shape (dof,) [rad/s^2].
+        jerk: Limits of jerk, shape (dof,) [rad/s^3].
+        start: Buffer, shape (3, dof).
+        control: Buffer, shape (N + 4, dof).
         deviation: Gets the largest distance of its knots from the places of the profile, of each joint, shape (dof,).
         times: Gets the times of its knots, shape (N + 2,) [s].
         out: Gets the states at them, shape (3, N + 2, dof).
@@ -132,9 +132,9 @@ def follow_profile(
         The number of knots; 0 where it breaks a limit.
     """
     dof, count = start.shape[1], len(profile) - 1
-    piece = path_piece(knots, begin, 0)
+    piece = path_piece(knots, place, 0)
     for i in range(dof):
-        start[0, i], start[1, i], start[2, i] = path_value(knots, states, piece, i, begin)
+        start[0, i], start[1, i], start[2, i] = path_value(knots, states, piece, i, place)
         deviation[i] = 0.0
     set_start(start, h, control)
     before = path_piece(knots, profile[1], piece)
@@ -165,19 +165,19 @@ def _blocked(spans: Floats, count: int, first: float, last: float) -> bool:
 @entry_point
 def first_blocked(
     places: Floats, spans: Floats, counts: Integers, points: Floats, point_spans: Floats, point_counts: Integers,
-    profile: Floats, begin: float, h: float,
+    profile: Floats, start: float, h: float,
 ) -> int:  # fmt: skip
     """Return the first step of a profile in which it may be at a place that is blocked, or -1.
 
     Args:
-        places: Begins and ends of the pieces of the path, shape (P, 2) [s].
+        places: Starts and ends of the pieces of the path, shape (P, 2) [s].
         spans: Their blocked intervals, shape (P, MOST_SPANS, 2) [s].
         counts: Their numbers, shape (P,).
         points: Places of which there are intervals, too, increasing, shape (S + 1,) [s].
         point_spans: Those, shape (S + 1, MOST_SPANS, 2) [s].
         point_counts: Their numbers, shape (S + 1,).
         profile: Places at times h apart, shape (N,) [s].
-        begin: Time of the first [s].
+        start: Time of the first [s].
         h: Spacing in time [s].
     """
     p = k = 0
@@ -186,14 +186,14 @@ def first_blocked(
         while k + 1 < len(points) and points[k] < first:
             k += 1
         if points[k] == first == last:
-            if _blocked(point_spans[k], point_counts[k], begin + n * h, begin + (n + 1) * h):
+            if _blocked(point_spans[k], point_counts[k], start + n * h, start + (n + 1) * h):
                 return n
             continue
         while p + 1 < len(places) and places[p, 1] <= first:
             p += 1
         r = p
         while r < len(places) and places[r, 0] < last:
-            if _blocked(spans[r], counts[r], begin + n * h, begin + (n + 1) * h):
+            if _blocked(spans[r], counts[r], start + n * h, start + (n + 1) * h):
                 return n
             r += 1
     return -1

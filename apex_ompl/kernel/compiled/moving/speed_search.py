@@ -8,7 +8,7 @@ path is constant, d^2s/dt^2 = (x' - x) / (2 length). The joints' limits must hol
 
 and the piece that is passed from t to t' must be free from t to t'. As in planning with safe intervals (Phillips and
 Likhachev 2011), what is kept of a point and a level is not a time but the intervals of all times at which it can be
-reached, for with a speed one cannot wait (Johnson and Hauser 2012 propagate reachable speeds likewise). At level 0 the
+reached, for with a speed one cannot wait (as Johnson and Hauser 2012 propagate reachable speeds). At level 0 the
 robot may wait while the point is free, which adds the times up to the next blocked interval. The earliest time at the
 end is then followed back.
 """
@@ -83,7 +83,7 @@ def _wait(spans: Floats, count: int, arrivals: Floats, number: int, latest: floa
 
 @inlined
 def _set_start(
-    spans: Floats, count: int, own: int, rests: bool, begin: float, latest: float, times: Floats, numbers: Integers,
+    spans: Floats, count: int, own: int, rests: bool, start: float, latest: float, times: Floats, numbers: Integers,
     arrivals: Floats, arrived: Integers,
 ) -> None:  # fmt: skip
     """Set the times of the first point, and no others."""
@@ -91,21 +91,21 @@ def _set_start(
         arrived[k] = 0
         for m in range(numbers.shape[1]):
             numbers[k, m] = 0
-    last = begin
+    last = start
     if rests:
-        last = min(free_until(spans, count, begin), latest)
-        arrivals[0, 0] = arrivals[0, 1] = begin
+        last = min(free_until(spans, count, start), latest)
+        arrivals[0, 0] = arrivals[0, 1] = start
         arrived[0] = 1
     for m in range(numbers.shape[1]):
         if rests or m == own:  # at rest q' is 0: it may go at any level
-            times[m, 0, 0], times[m, 0, 1] = begin, last
+            times[m, 0, 0], times[m, 0, 1] = start, last
             numbers[0, m] = 1
 
 
 @entry_point
 def earliest_arrivals(
     spans: Floats, counts: Integers, point_spans: Floats, point_counts: Integers, lowest: Floats, highest: Floats,
-    x: Floats, length: float, own: int, rests: bool, forced: int, begin: float, latest: float, hold: float,
+    x: Floats, length: float, own: int, rests: bool, forced: int, start: float, latest: float, hold: float,
     times: Floats, numbers: Integers, arrivals: Floats, arrived: Integers, work: Floats, passing: Floats,
     levels: Integers, departures: Floats,
 ) -> bool:  # fmt: skip
@@ -123,15 +123,15 @@ def earliest_arrivals(
         own: Level of the motion's own rate, x = 1: that at the start.
         rests: Whether it starts at rest: then it may wait there, and go at any level, as q' is 0.
         forced: Number of stages at the start that keep the motion's own rate.
-        begin: Time at the start [s].
+        start: Time at the start [s].
         latest: The last time at the end [s].
         hold: Time for which the end must stay free from the arrival on [s].
-        times: Room, shape (S + 1, levels, MOST_TIMES, 2).
-        numbers: Room, shape (S + 1, levels).
-        arrivals: Room, shape (S + 1, MOST_TIMES, 2).
-        arrived: Room, shape (S + 1,).
-        work: Room, shape (4 MOST_TIMES, 2).
-        passing: Room, shape (pieces a stage + 1,).
+        times: Buffer, shape (S + 1, levels, MOST_TIMES, 2).
+        numbers: Buffer, shape (S + 1, levels).
+        arrivals: Buffer, shape (S + 1, MOST_TIMES, 2).
+        arrived: Buffer, shape (S + 1,).
+        work: Buffer, shape (4 MOST_TIMES, 2).
+        passing: Buffer, shape (pieces a stage + 1,).
         levels: Gets the levels of the profile, shape (S + 1,).
         departures: Gets the times at which it arrives at and leaves the points, shape (S + 1, 2) [s].
 
@@ -140,7 +140,7 @@ def earliest_arrivals(
     """
     stages, most = len(point_counts) - 1, lowest.shape[1]
     pieces = len(counts) // stages
-    _set_start(point_spans[0], point_counts[0], own, rests, begin, latest, times[0], numbers, arrivals[0], arrived)
+    _set_start(point_spans[0], point_counts[0], own, rests, start, latest, times[0], numbers, arrivals[0], arrived)
     for k in range(stages):
         for i in range(most):
             for j in range(most):
@@ -194,7 +194,7 @@ def _contains(times: Floats, number: int, time: float) -> bool:
 
 @inlined
 def _passes(first: float, spans: Floats, counts: Integers, stage: int, pieces: int, passing: Floats) -> bool:
-    """Whether a stage may be begun at a time, rounded."""
+    """Whether a stage may start at a time, rounded."""
     for f in range(pieces):
         p = stage * pieces + f
         for n in range(counts[p]):
@@ -219,7 +219,7 @@ def _follow_back(
     x: Floats, length: float, forced: int, own: int, rests: bool, hold: float, times: Floats, numbers: Integers,
     arrivals: Floats, arrived: Integers, passing: Floats, levels: Integers, departures: Floats,
 ) -> bool:  # fmt: skip
-    """Set levels and times of the earliest arrival; each level the nearest to the one behind it."""
+    """Set levels and times of the earliest arrival; each level the nearest to the one after it."""
     stages = len(point_counts) - 1
     pieces = len(counts) // stages
     level, time = _best_end(point_spans[stages], point_counts[stages], times[stages], numbers[stages], hold)

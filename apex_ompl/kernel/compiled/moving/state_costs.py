@@ -1,8 +1,8 @@
-"""Clearance costs of states among obstacles that stand and that move, with gradients and Gauss-Newton matrices.
+"""Clearance costs of states among static and dynamic obstacles, with gradients and Gauss-Newton matrices.
 
-The cost of a state at a time is that of :mod:`apex_ompl.kernel.compiled.check.clearance_cost`, to which every cluster and
-every dynamic obstacle add the same term, with the dynamic obstacle where it is at that time and as much larger as its
-margin says.
+The cost of a state at a time is that of :mod:`apex_ompl.kernel.compiled.check.clearance_cost`, to which every cluster
+and every dynamic obstacle add the same term, with the dynamic obstacle at its place at that time and larger by its
+margin.
 """
 
 from __future__ import annotations

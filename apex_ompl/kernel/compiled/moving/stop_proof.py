@@ -1,4 +1,4 @@
-"""Stops from a motion at many of its times, proved against all that dynamic obstacles can have reached."""
+"""Stops from a motion at many of its times, proved against everything that dynamic obstacles can have reached."""
 
 from __future__ import annotations
 
@@ -61,20 +61,20 @@ def first_unproved_stop(
     offset: Floats, state: Floats, found: Integers, start: Floats, control: Floats, here: Floats, deviation: Floats,
     phases: Floats, times: Floats, out: Floats, stopped: Floats, stopped_rates: Floats,
 ) -> int:  # fmt: skip
-    """Return which of some moments is the first behind which no stop is proved, or their number.
+    """Return which of some moments is the first after which no stop is proved, or their number.
 
     At each, the dynamic obstacles were seen ``age`` before, where they are expected then, and may have gone anywhere
     since as far as their margins say, which are those of ``mf``. The next ``period`` of the motion is proved, then the
     soonest stop along it, which is that of :func:`apex_ompl.kernel.compiled.moving.stops.stop_on_path`, or else that of
     each joint by itself, of :func:`apex_ompl.kernel.compiled.moving.stops.stop_joints`. What stands still, and the
-    robot itself, are not looked at.
+    robot itself, are ignored.
 
     Args:
         ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
         rf: Robot.
         mi: Dynamic obstacles, packed; places, velocities and stamps are written to.
-        mf: DynamicObstacles.
-        ms: DynamicObstacles.
+        mf: Dynamic obstacles.
+        ms: Dynamic obstacles.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
         place: Where the dynamic obstacles are expected at their stamps, shape (M, 3) [m].
@@ -86,29 +86,29 @@ def first_unproved_stop(
         rates: Velocities and accelerations at the knots.
         slack: What the pieces miss each other by.
         motion: Positions, velocities and accelerations at the knots, shape (3, K, dof).
-        lower: Limits of stops, shape (dof,); likewise the next four.
-        upper: Highest positions.
-        fastest: Limits.
-        acceleration: Limits.
-        jerk: Limits.
+        lower: Lowest positions of stops, shape (dof,) [rad].
+        upper: Highest positions, shape (dof,) [rad].
+        fastest: Limits of velocity, shape (dof,) [rad/s].
+        acceleration: Limits of acceleration, shape (dof,) [rad/s^2].
+        jerk: Limits of jerk, shape (dof,) [rad/s^3].
         allowed: Largest distance of any joint from the path [rad].
         moments: Times of the motion, shape (N,) [s].
         by_joints: Gets whether the stop is that of each joint by itself, shape (N,).
         period: Time from a moment to the stop [s].
         clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
-        shortest: Length of an interval that is given up [s].
-        offset: Room for places, shape (M, 3).
-        state: Room, shape (dof,).
-        found: Room, shape (3,).
-        start: Room, shape (3, dof).
-        control: Room, shape (MOST_STEPS + 4, dof).
-        here: Room, shape (dof,).
-        deviation: Room, shape (dof,).
-        phases: Room, shape (2, dof, PHASES).
-        times: Room for the knots of a stop, shape (R,).
-        out: Room, shape (3, R, dof).
-        stopped: Room, shape (R, dof).
-        stopped_rates: Room, shape (R, 2 dof).
+        shortest: Length of an interval that is not divided further [s].
+        offset: Buffer for places, shape (M, 3).
+        state: Buffer, shape (dof,).
+        found: Buffer, shape (3,).
+        start: Buffer, shape (3, dof).
+        control: Buffer, shape (MOST_STEPS + 4, dof).
+        here: Buffer, shape (dof,).
+        deviation: Buffer, shape (dof,).
+        phases: Buffer, shape (2, dof, PHASES).
+        times: Buffer for the knots of a stop, shape (R,).
+        out: Buffer, shape (3, R, dof).
+        stopped: Buffer, shape (R, dof).
+        stopped_rates: Buffer, shape (R, 2 dof).
     """
     t, m = robot_view(ri, rf), dynamic_view(mi, mf, ms)
     w = workspace_view(t, wi, wf)
@@ -120,11 +120,11 @@ def first_unproved_stop(
         resting, proved = then >= end - SAME_TIME, False
         by_joints[n] = 0
         for kind in range(3):  # the next period of the motion, the stop along it, that of each joint
-            at, curve, curve_rates, begin, until, zero, count = knots, states, rates, moments[n], then, clock, 0
+            at, curve, curve_rates, since, until, zero, count = knots, states, rates, moments[n], then, clock, 0
             if kind == 0 and resting:
                 until = end
             if kind == 1:
-                begin, until = then, end
+                since, until = then, end
                 count = soonest_stop(
                     knots, motion, then, start, lower, upper, fastest, acceleration, jerk, allowed, control, here,
                     deviation, times, out,
@@ -138,9 +138,9 @@ def first_unproved_stop(
             if count > 0:  # else the rest of the motion is as soon
                 _set_curve(count, out, stopped, stopped_rates)
                 at, curve, curve_rates = times[:count], stopped[:count], stopped_rates[:count]
-                begin, until, zero = 0.0, times[count - 1], clock + then
+                since, until, zero = 0.0, times[count - 1], clock + then
             clear = conflict_on(
-                t, m, s, w, at, curve, curve_rates, slack, begin, until, zero, shortest, offset, state, found
+                t, m, s, w, at, curve, curve_rates, slack, since, until, zero, shortest, offset, state, found
             )  # fmt: skip
             if kind == 0 and (resting or not clear == math.inf):
                 proved = clear == math.inf

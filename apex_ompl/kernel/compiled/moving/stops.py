@@ -10,7 +10,7 @@ This is the problem of Ruckig's velocity interface (Berscheid and Kroeger 2021),
 ends braking early so as to rest with both v and a at 0; where it would pass a position limit, braking goes on for as
 short a time as keeps the limit, until v = 0 at the latest, and the joint swings back.
 
-Along the path: the motion goes on unchanged for a time, mostly none. From there on its own time s advances by d_k in
+Along the path: the motion goes on unchanged for a time, mostly none. Then its own time s advances by d_k in
 the k-th step of length h, and the joints follow the spline with control points c_k = q(s_k), but for the first three
 (:mod:`apex_ompl.kernel.compiled.moving.time_spline`). Each step is the shortest that keeps a share of the joints'
 limits of acceleration, |c_k+1 - 2 c_k + c_k-1| <= share a_max h^2, with q(s_k + d) taken as linear in d up to d_k-1.
@@ -66,8 +66,8 @@ def widened(low: float, high: float, q: float, v: float, a: float, j: float, t: 
 
 
 @inlined
-def _set_soonest(v: float, a: float, most: float, jerk: float, begin: int, lengths: Floats, jerks: Floats) -> None:
-    """Set the three phases of the soonest stop, from the phase ``begin`` on."""
+def _set_soonest(v: float, a: float, most: float, jerk: float, first: int, lengths: Floats, jerks: Floats) -> None:
+    """Set the three phases of the soonest stop, from the phase ``first`` on."""
     sign = 1.0 if v + a * abs(a) / (2.0 * jerk) >= 0.0 else -1.0
     v, a = sign * v, sign * a
     peak = math.sqrt(max(jerk * v + 0.5 * a * a, 0.0))
@@ -75,9 +75,9 @@ def _set_soonest(v: float, a: float, most: float, jerk: float, begin: int, lengt
     if peak > most:
         plateau = (v + 0.5 * a * a / jerk) / most - most / jerk
         peak = most
-    lengths[begin], jerks[begin] = max(a + peak, 0.0) / jerk, -sign * jerk
-    lengths[begin + 1], jerks[begin + 1] = max(plateau, 0.0), 0.0
-    lengths[begin + 2], jerks[begin + 2] = peak / jerk, sign * jerk
+    lengths[first], jerks[first] = max(a + peak, 0.0) / jerk, -sign * jerk
+    lengths[first + 1], jerks[first + 1] = max(plateau, 0.0), 0.0
+    lengths[first + 2], jerks[first + 2] = peak / jerk, sign * jerk
 
 
 @inlined
@@ -190,15 +190,15 @@ def soonest_stops(
         beyond[i] = _set_stop(q[i], v[i], a[i], lower[i], upper[i], most, JERK_SHARE * jerk[i], lengths[i], jerks[i])
     count = _sorted_times(lengths, times)
     for i in range(len(q)):
-        k, begin = 0, 0.0
+        k, when = 0, 0.0
         x, y, z = q[i], v[i], a[i]
         for p in range(PHASES):
-            while k < count and times[k] < begin + lengths[i, p]:
-                since = max(times[k] - begin, 0.0)
+            while k < count and times[k] < when + lengths[i, p]:
+                since = max(times[k] - when, 0.0)
                 knots[0, k, i], knots[1, k, i], knots[2, k, i] = moved(x, y, z, jerks[i, p], since)
                 k += 1
             x, y, z = moved(x, y, z, jerks[i, p], lengths[i, p])
-            begin += lengths[i, p]
+            when += lengths[i, p]
         for rest in range(k, count):
             knots[0, rest, i], knots[1, rest, i], knots[2, rest, i] = x, 0.0, 0.0
     return count
@@ -213,14 +213,14 @@ def stop_joints(
 
     Args:
         q: Positions, shape (dof,) [rad].
-        v: Velocities, likewise [rad/s].
-        a: Accelerations, likewise [rad/s^2].
-        lower: Lowest positions, likewise.
-        upper: Highest positions, likewise.
-        acceleration: Limits, likewise.
-        jerk: Limits, likewise.
-        lengths: Room for the lengths of the phases, shape (dof, PHASES) [s].
-        jerks: Room for the jerks in them, likewise [rad/s^3].
+        v: Velocities, shape (dof,) [rad/s].
+        a: Accelerations, shape (dof,) [rad/s^2].
+        lower: Lowest positions, shape (dof,) [rad].
+        upper: Highest positions, shape (dof,) [rad].
+        acceleration: Limits of acceleration, shape (dof,) [rad/s^2].
+        jerk: Limits of jerk, shape (dof,) [rad/s^3].
+        lengths: Buffer for the lengths of the phases, shape (dof, PHASES) [s].
+        jerks: Buffer for the jerks in them, shape (dof, PHASES) [rad/s^3].
         times: Gets the times at which the jerk of any joint changes, shape (dof PHASES + 1,) [s].
         knots: Gets positions, velocities and accelerations at them, shape (3, that, dof).
         beyond: Gets how far each joint passes a position limit, shape (dof,) [rad].
@@ -246,7 +246,7 @@ def _step(
     knots: Floats, states: Floats, piece: int, s: float, before: float, braked: float, h: float,
     acceleration: Floats, jerk: Floats, shares: tuple[float, float], control: Floats, k: int, here: Floats,
 ) -> float:  # fmt: skip
-    """Return the length of the step behind control point ``k``, whose place is ``here`` (dof,)."""
+    """Return the length of the step after control point ``k``, whose place is ``here`` (dof,)."""
     most, least, change = before, 0.0, math.inf
     following = path_piece(knots, s + before, piece)
     for i in range(len(here)):
@@ -265,17 +265,17 @@ def _step(
 
 @inlined
 def _brake(
-    knots: Floats, states: Floats, begin: float, start: Floats, h: float, most: int, lower: Floats, upper: Floats,
+    knots: Floats, states: Floats, when: float, start: Floats, h: float, most: int, lower: Floats, upper: Floats,
     velocity: Floats, acceleration: Floats, jerk: Floats, shares: tuple[float, float],
     control: Floats, here: Floats, deviation: Floats,
 ) -> int:  # fmt: skip
     """Lay the spline of a motion that brakes; return the number of its last step, or 0 where it breaks a limit."""
     set_start(start, h, control)
-    piece = path_piece(knots, begin + h, path_piece(knots, begin, 0))
+    piece = path_piece(knots, when + h, path_piece(knots, when, 0))
     for i in range(len(here)):
-        here[i] = path_value(knots, states, piece, i, begin + h)[0]
+        here[i] = path_value(knots, states, piece, i, when + h)[0]
         deviation[i] = 0.0
-    s, before, braked, last = begin + h, h, 0.0, 0
+    s, before, braked, last = when + h, h, 0.0, 0
     for k in range(2, most):
         length = 0.0
         if last == 0:
@@ -300,12 +300,12 @@ def _brake(
 
 
 @inlined
-def _copy(knots: Floats, states: Floats, begin: float, end: float, times: Floats, out: Floats) -> int:
-    """Put the knots of a motion from ``begin`` to before ``end`` into place; return their number."""
-    piece = path_piece(knots, begin, 0)
-    count, time = 0, begin
+def _copy(knots: Floats, states: Floats, when: float, end: float, times: Floats, out: Floats) -> int:
+    """Put the knots of a motion from ``when`` to before ``end`` into place; return their number."""
+    piece = path_piece(knots, when, 0)
+    count, time = 0, when
     while time < end - SAME_TIME:
-        times[count] = time - begin
+        times[count] = time - when
         for i in range(out.shape[2]):
             values = path_value(knots, states, piece, i, time)
             out[0, count, i], out[1, count, i], out[2, count, i] = values
@@ -325,39 +325,39 @@ def set_place(knots: Floats, states: Floats, time: float, out: Floats) -> None:
 
 @inlined
 def _attempt(
-    knots: Floats, states: Floats, begin: float, start: Floats, h: float, most: int, lower: Floats, upper: Floats,
+    knots: Floats, states: Floats, when: float, start: Floats, h: float, most: int, lower: Floats, upper: Floats,
     velocity: Floats, acceleration: Floats, jerk: Floats, shares: tuple[float, float],
     control: Floats, here: Floats, deviation: Floats,
 ) -> int:  # fmt: skip
-    """Set the state at ``begin``, and brake from there; see :func:`_brake`."""
-    set_place(knots, states, begin, start)
+    """Set the state at ``when``, and brake from there; see :func:`_brake`."""
+    set_place(knots, states, when, start)
     return _brake(
-        knots, states, begin, start, h, most, lower, upper, velocity, acceleration, jerk, shares, control, here,
+        knots, states, when, start, h, most, lower, upper, velocity, acceleration, jerk, shares, control, here,
         deviation,
     )  # fmt: skip
 
 
 @inlined
 def soonest_stop(
-    knots: Floats, states: Floats, begin: float, start: Floats, lower: Floats, upper: Floats, velocity: Floats,
+    knots: Floats, states: Floats, when: float, start: Floats, lower: Floats, upper: Floats, velocity: Floats,
     acceleration: Floats, jerk: Floats, allowed: float, control: Floats, here: Floats, deviation: Floats,
     times: Floats, out: Floats,
 ) -> int:  # fmt: skip
     """Find the soonest stop along the path of a motion, see :func:`stop_on_path`."""
-    dof, end, piece = start.shape[1], knots[len(knots) - 1], path_piece(knots, begin, 0)
+    dof, end, piece = start.shape[1], knots[len(knots) - 1], path_piece(knots, when, 0)
     widest, time = 0.0, 0.0
     for i in range(dof):
         widest = max(widest, acceleration[i])
-        time = max(time, abs(path_value(knots, states, piece, i, begin)[1]) / acceleration[i])
+        time = max(time, abs(path_value(knots, states, piece, i, when)[1]) / acceleration[i])
     h = min(math.sqrt(allowed / (CURVING * widest)), max(time / LEAST_STEPS, SHORTEST))
-    best, delay_of, shares_of, last, is_laid = end - begin, -1.0, SHARES[0], 0, False
+    best, delay_of, shares_of, last, is_laid = end - when, -1.0, SHARES[0], 0, False
     for shares in SHARES:
         for delay in DELAYS:
             most = min(int((best - delay) / h) - 1, MOST_STEPS)
             if most < 3 or delay >= delay_of >= 0.0:
                 break
             count = _attempt(
-                knots, states, begin + delay, start, h, most, lower, upper, velocity, acceleration, jerk, shares,
+                knots, states, when + delay, start, h, most, lower, upper, velocity, acceleration, jerk, shares,
                 control, here, deviation,
             )  # fmt: skip
             is_laid = count > 0
@@ -365,9 +365,9 @@ def soonest_stop(
                 best, delay_of, shares_of, last = delay + (count + 1) * h, delay, shares, count
     if delay_of < 0.0:
         return 0
-    if not is_laid:  # another one was tried behind it
+    if not is_laid:  # another one was tried after it
         last = _attempt(
-            knots, states, begin + delay_of, start, h, MOST_STEPS, lower, upper, velocity, acceleration, jerk,
+            knots, states, when + delay_of, start, h, MOST_STEPS, lower, upper, velocity, acceleration, jerk,
             shares_of, control, here, deviation,
         )  # fmt: skip
     for i in range(dof):
@@ -375,13 +375,13 @@ def soonest_stop(
         for k in range(piece, len(knots)):
             curved = max(curved, abs(states[2, k, i]))
         deviation[i] += h * h / 8.0 * (acceleration[i] + curved)
-    copied = _copy(knots, states, begin, begin + delay_of, times, out) if delay_of > 0.0 else 0
+    copied = _copy(knots, states, when, when + delay_of, times, out) if delay_of > 0.0 else 0
     return copied + spline_knots(start, control, last, h, delay_of, times[copied:], out[:, copied:])
 
 
 @entry_point
 def stop_on_path(
-    knots: Floats, states: Floats, begin: float, start: Floats, lower: Floats, upper: Floats, velocity: Floats,
+    knots: Floats, states: Floats, when: float, start: Floats, lower: Floats, upper: Floats, velocity: Floats,
     acceleration: Floats, jerk: Floats, allowed: float, control: Floats, here: Floats, deviation: Floats,
     times: Floats, out: Floats,
 ) -> int:  # fmt: skip
@@ -390,16 +390,16 @@ def stop_on_path(
     Args:
         knots: Times of the motion, shape (K,) [s].
         states: Positions, velocities and accelerations at them, shape (3, K, dof).
-        begin: Time from which it stops [s].
-        start: Room for a state, shape (3, dof).
-        lower: Limits of the joints, shape (dof,); likewise the next four.
-        upper: Highest positions.
-        velocity: Limits.
-        acceleration: Limits.
-        jerk: Limits.
+        when: Time from which it stops [s].
+        start: Buffer for a state, shape (3, dof).
+        lower: Lowest positions, shape (dof,) [rad].
+        upper: Highest positions, shape (dof,) [rad].
+        velocity: Limits of velocity, shape (dof,) [rad/s].
+        acceleration: Limits of acceleration, shape (dof,) [rad/s^2].
+        jerk: Limits of jerk, shape (dof,) [rad/s^3].
         allowed: Largest distance of any joint from the path [rad].
-        control: Room, shape (MOST_STEPS + 4, dof).
-        here: Room, shape (dof,).
+        control: Buffer, shape (MOST_STEPS + 4, dof).
+        here: Buffer, shape (dof,).
         deviation: Gets a bound on the distance of each joint from the path, shape (dof,) [rad].
         times: Gets the times of the knots, shape (K + MOST_STEPS + 4,) [s].
         out: Gets the states at them, shape (3, K + MOST_STEPS + 4, dof).
@@ -409,7 +409,7 @@ def stop_on_path(
     """
     return int(
         soonest_stop(
-            knots, states, begin, start, lower, upper, velocity, acceleration, jerk, allowed, control, here, deviation,
+            knots, states, when, start, lower, upper, velocity, acceleration, jerk, allowed, control, here, deviation,
             times, out,
         )
     )  # fmt: skip

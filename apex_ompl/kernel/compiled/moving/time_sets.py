@@ -1,4 +1,4 @@
-"""Sets of times as disjoint intervals in order, in rows of arrays (N, 2) of which the first ones count."""
+"""Sets of times as disjoint intervals in order, in the first rows of arrays of shape (N, 2) [s]."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 
-NEAR = 3e-3  # behind an interval that is kept; times so near it are left out [s]
+NEAR = 3e-3  # after an interval that is kept; times so near it are left out [s]
 
 
 @inlined
@@ -81,7 +81,7 @@ def add_free(
     first: float, last: float, spans: Floats, counts: Integers, stage: int, pieces: int, passing: Floats, out: Floats,
     count: int, work: Floats,
 ) -> int:  # fmt: skip
-    """Add the arrivals of a stage begun between two times that meet no blocked interval to ``out``; return how many."""
+    """Add to ``out`` the free arrivals of a stage that starts between two times; return how many there are."""
     work[0, 0], work[0, 1] = first, last
     parts = 1
     for f in range(pieces):

@@ -23,7 +23,7 @@ ROUNDING = 1e-9  # share by which a limit may be exceeded, and distance beyond a
 
 @inlined
 def path_piece(knots: Floats, s: float, k: int) -> int:
-    """Return the piece of the path that ``s`` lies on, at ``k`` or behind it."""
+    """Return the piece of the path that ``s`` lies on, at ``k`` or after it."""
     while k + 2 < len(knots) and knots[k + 1] <= s:
         k += 1
     return k
@@ -31,7 +31,7 @@ def path_piece(knots: Floats, s: float, k: int) -> int:
 
 @inlined
 def path_value(knots: Floats, states: Floats, k: int, i: int, s: float) -> tuple[float, float, float]:
-    """Return position, velocity and acceleration of joint ``i`` at ``s`` on piece ``k``; at rest behind the end."""
+    """Return position, velocity and acceleration of joint ``i`` at ``s`` on piece ``k``; at rest after the end."""
     if len(knots) == 1 or s >= knots[len(knots) - 1]:
         return states[0, len(knots) - 1, i], 0.0, 0.0
     since, jerk = s - knots[k], (states[2, k + 1, i] - states[2, k, i]) / (knots[k + 1] - knots[k])
@@ -73,7 +73,9 @@ def set_start(start: Floats, h: float, control: Floats) -> None:
 
 
 @inlined
-def spline_knots(start: Floats, control: Floats, count: int, h: float, begin: float, times: Floats, out: Floats) -> int:
+def spline_knots(
+    start: Floats, control: Floats, count: int, h: float, first_time: float, times: Floats, out: Floats
+) -> int:
     """Put the knots of a spline that rests after ``count + 1`` steps into place; return their number.
 
     Args:
@@ -81,12 +83,12 @@ def spline_knots(start: Floats, control: Floats, count: int, h: float, begin: fl
         control: Its control points, shape (count + 4, dof) or more.
         count: See above.
         h: Length of the steps [s].
-        begin: Time of the first knot [s].
+        first_time: Time of the first knot [s].
         times: Gets the times, shape (count + 2,) or more [s].
         out: Gets positions, velocities and accelerations, shape (3, that, dof).
     """
     for k in range(count + 2):
-        times[k] = begin + k * h
+        times[k] = first_time + k * h
         for i in range(start.shape[1]):
             x, y, z = control[k, i], control[k + 1, i], control[k + 2, i]
             out[0, k, i] = (x + 4.0 * y + z) / 6.0

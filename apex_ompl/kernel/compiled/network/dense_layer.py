@@ -32,7 +32,7 @@ _by_four, _by_one = _products(TILE, 4), _products(ALONE, 1)
 
 @inlined
 def _rest(weight: Bytes, i: int, rows: Singles, b: int) -> float:
-    """Return the part of the sum of products of two rows that is left behind whole vectors."""
+    """Return the part of the sum of products of two rows that remains after whole vectors."""
     found = np.float32(0.0)
     for k in range(weight.shape[1] - weight.shape[1] % LANES, weight.shape[1]):
         found += np.float32(weight[i, k]) * rows[b, k]

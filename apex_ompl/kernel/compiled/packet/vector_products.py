@@ -21,7 +21,7 @@ def row_products(weights: int, rows: int, lanes: int) -> Callable[..., Any]:
     """Return a compiled function of some rows of weights, in eight bits, by some rows of numbers.
 
     ``products(weight, i, x, b)``, with matrices of shapes (N, K) and (B, K), gives the sums of
-    ``weight[i + m, k] * x[b + n, k]`` over k, the last K % lanes left out, at ``rows * m + n``. For rows behind the
+    ``weight[i + m, k] * x[b + n, k]`` over k, the last K % lanes left out, at ``rows * m + n``. For rows after the
     last one of a matrix that one is taken.
     """
 
@@ -45,7 +45,7 @@ def row_products(weights: int, rows: int, lanes: int) -> Callable[..., Any]:
 
 
 def _addresses(builder: Any, matrix: Any, first: Any, count: int) -> list[Any]:
-    """Return where some rows of a matrix begin; behind the last row it is that one."""
+    """Return where some rows of a matrix start; after the last row it is that one."""
     rows, width = cgutils.unpack_tuple(builder, matrix.shape, 2)
     last, found = builder.sub(rows, rows.type(1)), []
     for k in range(count):
@@ -83,12 +83,12 @@ def _added_up(builder: Any, vectors: list[Any]) -> list[Any]:
 
 
 def _pairs_added(builder: Any, first: Any, second: Any) -> Any:
-    """Return the sums of neighbors in a vector, and behind them those in another one, if there is one."""
+    """Return the sums of neighbors in a vector, and after them those in another one, if there is one."""
     other = ir.Constant(first.type, ir.Undefined) if second is None else second
     width = first.type.count * (1 if second is None else 2)
     halves = []
-    for begin in (0, 1):
-        chosen = list(range(begin, width, 2))
+    for start in (0, 1):
+        chosen = list(range(start, width, 2))
         halves.append(builder.shuffle_vector(first, other, ir.Constant(_kind(WORD, len(chosen)), chosen)))
     return builder.fadd(*halves)
 
@@ -99,7 +99,7 @@ def _kind(of: Any, lanes: int) -> Any:
 
 
 def _place(builder: Any, address: Any, k: Any, kind: Any) -> Any:
-    """Return the address of what is of a type and begins at the k-th number behind an address."""
+    """Return the address of a value of a type that starts at the k-th number after an address."""
     return builder.bitcast(builder.gep(address, [k]), kind.as_pointer())
 
 

@@ -94,7 +94,7 @@ class Buffers(NamedTuple):
         row: Gradient of one clearance at a sample.
         state_gradient: Gradient of the clearance cost of a sample.
         state_gram: Lower half of its Gauss-Newton matrix.
-        room: Room for a row of it times the weights of a sample.
+        room: Buffer for a row of it times the weights of a sample.
         held: Whether an unknown stays at its limit.
     """
 
@@ -155,8 +155,8 @@ def add_sample(
     for d in range(dof):
         for e in range(d):
             matrix[e, d] = matrix[d, e]
-    begin, end = max(0, pinned - first), min(len(weights), free + pinned - first)
-    for m in range(begin, end):
+    start, end = max(0, pinned - first), min(len(weights), free + pinned - first)
+    for m in range(start, end):
         i, f = first + m - pinned, share * weights[m]
         for d in range(dof):
             gradient[i * dof + d] += f * here[d]
@@ -164,15 +164,15 @@ def add_sample(
         if not matrix[d, d] > 0.0:  # the joint moves nothing that is near
             continue
         source = matrix[d]
-        for k in range(begin, end):
-            scaled = room[(k - begin) * dof : (k - begin + 1) * dof]
+        for k in range(start, end):
+            scaled = room[(k - start) * dof : (k - start + 1) * dof]
             for n in range(dof):
                 scaled[n] = weights[k] * source[n]
-        at = (first + begin - pinned) * dof
-        for m in range(begin, end):
+        at = (first + start - pinned) * dof
+        for m in range(start, end):
             i, f = first + m - pinned, share * weights[m]
-            shift, behind = (m - begin) * dof, (end - begin) * dof
-            target, scaled = gram[i * dof + d, at + shift : at + behind], room[shift:behind]
+            shift, stop = (m - start) * dof, (end - start) * dof
+            target, scaled = gram[i * dof + d, at + shift : at + stop], room[shift:stop]
             for j in range(len(target)):
                 target[j] += f * scaled[j]
 

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt steps on the control points of a path, on the cost of :mod:`apex_ompl.kernel.compiled.path.path_cost`.
+"""Levenberg-Marquardt steps on the control points of a path, see :mod:`apex_ompl.kernel.compiled.path.path_cost`.
 
 A step solves
 
@@ -62,7 +62,7 @@ def _take_away(factor: Floats, k: int, last: int, end: int, panel: Floats) -> No
     """Take away what the BLOCK rows from ``k`` on have in the rows below, up to ``end``.
 
     Pieces of the rows are copied next to each other: between rows whose distance is a constant no test is needed of
-    whether they overlap, nor, with indices that cannot be negative, of where they begin.
+    whether they overlap, nor, with indices that cannot be negative, of where they start.
     """
     for first in range(last, end, STRIDE):
         length = min(STRIDE, end - first)
@@ -152,7 +152,7 @@ def _newton_step(
 
 @reassociating_inlined
 def _hold(t: RobotArrays, control: Floats, pinned: int, gradient: Floats, held: Integers, step: Floats) -> None:
-    """List the unknowns that the gradient would push beyond their limits, and begin a step with -gradient."""
+    """List the unknowns that the gradient would push beyond their limits, and start a step with -gradient."""
     dof = control.shape[1]
     for i in range(len(step)):
         d = i % dof

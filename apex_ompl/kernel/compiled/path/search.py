@@ -149,7 +149,7 @@ def _pop(keys: Floats, nodes: Integers, size: int) -> int:
 
 @entry_point
 def shortest_path(
-    begins: Integers, ends: Integers, lengths: Floats, usable: Integers, entry: Floats, leave: Floats,
+    first: Integers, ends: Integers, lengths: Floats, usable: Integers, entry: Floats, leave: Floats,
     heuristic: Floats, cost: Floats, parent: Integers, keys: Floats, nodes: Integers,
 ) -> int:  # fmt: skip
     """Return the last node of a shortest path, found by A* (Hart, Nilsson and Raphael 1968), or -1 without one.
@@ -157,14 +157,14 @@ def shortest_path(
     The path goes from a start over a node to enter by, along edges, to a node to leave by, and to a goal.
 
     Args:
-        begins: First edge of each node, shape (N + 1,).
+        first: First edge of each node, shape (N + 1,).
         ends: Node that each directed edge leads to, shape (E,).
         lengths: Length of each edge, shape (E,).
         usable: 0 for edges that may not be used, shape (E,).
-        entry: Length of the way from the start to each node, shape (N,); infinite where there is none.
-        leave: Length of the way from each node to a goal, shape (N,); infinite where there is none.
-        heuristic: Consistent lower bound on the length of the way to a goal, shape (N,).
-        cost: Filled with the length of the way to each node, shape (N,).
+        entry: Distance from the start to each node, shape (N,); infinite where there is none.
+        leave: Distance from each node to a goal, shape (N,); infinite where there is none.
+        heuristic: Consistent lower bound on the distance to a goal, shape (N,).
+        cost: Filled with the distance to each node, shape (N,).
         parent: Filled with the edge by which each node is reached, shape (N,); -1 from the start.
         keys: Buffer, shape (N + E,).
         nodes: Buffer, shape (N + E,).
@@ -181,9 +181,9 @@ def shortest_path(
             continue
         if cost[i] + leave[i] < best:
             best, last = cost[i] + leave[i], i
-        for e in range(begins[i], begins[i + 1]):
-            j, way = ends[e], cost[i] + lengths[e]
-            if usable[e] and way < cost[j]:
-                cost[j], parent[j] = way, e
-                size = _push(keys, nodes, size, way + heuristic[j], j)
+        for e in range(first[i], first[i + 1]):
+            j, found = ends[e], cost[i] + lengths[e]
+            if usable[e] and found < cost[j]:
+                cost[j], parent[j] = found, e
+                size = _push(keys, nodes, size, found + heuristic[j], j)
     return last

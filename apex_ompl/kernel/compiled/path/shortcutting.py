@@ -30,7 +30,7 @@ def _leave_out(
 ) -> tuple[int, int]:  # fmt: skip
     """Leave out corners between which the straight motion is proved, most at a time, from a corner on.
 
-    It ends behind the corner at which it has tried ``tries`` motions or more.
+    It ends after the corner at which it has tried ``tries`` motions or more.
 
     Returns:
         How many corners are left, and the corner from which to go on.
@@ -115,7 +115,7 @@ def shortcut_path(
         sg: Scene.
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
-        draws: Where shortcuts begin and end, as shares of the length, shape (N, 2).
+        draws: Where shortcuts start and end, as shares of the length, shape (N, 2).
         resolution: Largest spacing of the states that are checked [rad, max-norm].
         path: Corners of the path, shape (M, dof), with room for more.
         progress: Their number, the corner from which corners are left out, and for how many motions that is tried,

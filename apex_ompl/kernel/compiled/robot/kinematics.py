@@ -149,8 +149,8 @@ def mark_near(
 ) -> bool:  # fmt: skip
     """Mark the bodies of a cluster that are within ``reach`` of a point of the world; whether there are any.
 
-    A body of a cluster of several is looked at as its root sphere alone. What is not a number counts as near. Only the
-    parts that are bits of ``parts`` are looked at; those that are farther than their balls reach are not placed.
+    A body of a cluster of several is examined as its root sphere alone. What is not a number counts as near. Only the
+    parts that are bits of ``parts`` are examined; those that are farther than their balls reach are not placed.
     """
     radii = t.node_outer if leaves else t.node_radius
     if t.cluster_bodies[c, 1] == 1:

@@ -43,7 +43,7 @@ def sample_motion(
         accelerations: At them.
         times: Shape (N,) [s].
         order: Of the first derivative that is wanted, 0 to 3.
-        out: Gets it and those behind it, shape (derivatives, N, dof).
+        out: Gets it and those after it, shape (derivatives, N, dof).
     """
     last, end = len(knots) - 1, knots[len(knots) - 1]
     for n in range(len(times)):
@@ -95,7 +95,7 @@ def motion_extremes(knots: Floats, positions: Floats, velocities: Floats, accele
     """Find the extremes of a motion, which are those between knots, too.
 
     Velocities are largest at knots or where the acceleration is 0, positions where a joint turns round. Jerks are the
-    least that the knots can be said to have: between knots 1e-10 s apart, as several joints' own make them, the
+    least that the knots allow for: between knots 1e-10 s apart, as several joints' own make them, the
     rounding of times and accelerations alone is worth 1e-6 of a jerk and more.
 
     Args:

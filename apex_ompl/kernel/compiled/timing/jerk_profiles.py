@@ -23,22 +23,22 @@ def _sort(values: Integers, count: int) -> None:
 
 @inlined
 def _lay_pieces(
-    phases: Floats, jerks: Floats, first: int, last: int, k: int, j: int, begins: Integers, pieces: Floats
+    phases: Floats, jerks: Floats, first: int, last: int, k: int, j: int, edges: Integers, pieces: Floats
 ) -> None:
     """Write the beginnings of the pieces of a profile [ticks], phases and splits alike, and their jerks."""
     count, size = phases.shape[2], phases.shape[2] + SPLITS - 1
     end = first * TICK
     for p in range(count):
-        begins[k, j, p] = min(max(round(end / TICK), first), last)
+        edges[k, j, p] = min(max(round(end / TICK), first), last)
         end += phases[k, j, p]
-    begins[k, j, 0] = first
+    edges[k, j, 0] = first
     for s in range(1, SPLITS):
-        begins[k, j, count + s - 1] = first + (last - first) * s // SPLITS
-    _sort(begins[k, j], size)
+        edges[k, j, count + s - 1] = first + (last - first) * s // SPLITS
+    _sort(edges[k, j], size)
     phase, end = 0, first * TICK + phases[k, j, 0]
     for p in range(size):
-        following = begins[k, j, p + 1] if p + 1 < size else last
-        middle = 0.5 * (begins[k, j, p] + following) * TICK
+        following = edges[k, j, p + 1] if p + 1 < size else last
+        middle = 0.5 * (edges[k, j, p] + following) * TICK
         while phase + 1 < count and end <= middle:
             phase += 1
             end += phases[k, j, phase]
@@ -46,14 +46,14 @@ def _lay_pieces(
 
 
 @inlined
-def _correct(states: Floats, last: int, k: int, j: int, begins: Integers, pieces: Floats) -> None:
+def _correct(states: Floats, last: int, k: int, j: int, edges: Integers, pieces: Floats) -> None:
     """Change the jerks of a profile by the least that lets it end at its target.
 
     The state at the end is linear in the jerks. With the duration as the unit of time, what a piece of length h, at
     whose end r is left, adds per unit of jerk is h (r^2 / 2 + r h / 2 + h^2 / 6) to the position, h (r + h / 2) to the
     velocity, and h to the acceleration.
     """
-    size, first = begins.shape[2], begins[k, j, 0]
+    size, first = edges.shape[2], edges[k, j, 0]
     t = (last - first) * TICK
     if t <= 0.0:
         return
@@ -64,8 +64,8 @@ def _correct(states: Floats, last: int, k: int, j: int, begins: Integers, pieces
     xx = yy = zz = REGULARIZATION
     xy = xz = yz = 0.0
     for p in range(size):
-        following = begins[k, j, p + 1] if p + 1 < size else last
-        h, r = (following - begins[k, j, p]) * TICK / t, (last - following) * TICK / t
+        following = edges[k, j, p + 1] if p + 1 < size else last
+        h, r = (following - edges[k, j, p]) * TICK / t, (last - following) * TICK / t
         gx, gy, gz = h * (r * r / 2.0 + r * h / 2.0 + h * h / 6.0), h * (r + h / 2.0), h
         jerk = pieces[3, k, j, p]
         x, y, z = x - gx * jerk, y - gy * jerk, z - gz * jerk
@@ -78,21 +78,21 @@ def _correct(states: Floats, last: int, k: int, j: int, begins: Integers, pieces
     y = (y - yz * z) / yy
     x = (x - xy * y - xz * z) / xx
     for p in range(size):
-        following = begins[k, j, p + 1] if p + 1 < size else last
-        h, r = (following - begins[k, j, p]) * TICK / t, (last - following) * TICK / t
+        following = edges[k, j, p + 1] if p + 1 < size else last
+        h, r = (following - edges[k, j, p]) * TICK / t, (last - following) * TICK / t
         gx, gy, gz = h * (r * r / 2.0 + r * h / 2.0 + h * h / 6.0), h * (r + h / 2.0), h
         pieces[3, k, j, p] += gx * x + gy * y + gz * z
 
 
 @inlined
-def _integrate(states: Floats, last: int, k: int, j: int, begins: Integers, pieces: Floats) -> None:
-    """Write the position, velocity and acceleration at the beginning of each piece of a profile."""
-    size = begins.shape[2]
+def _integrate(states: Floats, last: int, k: int, j: int, edges: Integers, pieces: Floats) -> None:
+    """Write the position, velocity and acceleration at the start of each piece of a profile."""
+    size = edges.shape[2]
     q, v, a = states[0, k, j], states[1, k, j], states[2, k, j]
     for p in range(size):
         pieces[0, k, j, p], pieces[1, k, j, p], pieces[2, k, j, p] = q, v, a
-        following = begins[k, j, p + 1] if p + 1 < size else last
-        t, jerk = (following - begins[k, j, p]) * TICK, pieces[3, k, j, p]
+        following = edges[k, j, p + 1] if p + 1 < size else last
+        t, jerk = (following - edges[k, j, p]) * TICK, pieces[3, k, j, p]
         q += t * (v + t * (a / 2.0 + t * jerk / 6.0))
         v += t * (a + t * jerk / 2.0)
         a += t * jerk
@@ -101,7 +101,7 @@ def _integrate(states: Floats, last: int, k: int, j: int, begins: Integers, piec
 @entry_point
 def join_profiles(
     phases: Floats, jerks: Floats, starts: Integers, states: Floats,
-    begins: Integers, pieces: Floats, merged: Integers, times: Floats, knots: Floats,
+    edges: Integers, pieces: Floats, merged: Integers, times: Floats, knots: Floats,
 ) -> int:  # fmt: skip
     """Join the profiles of state-to-state problems to a motion, whose knots are where the jerk of any joint changes.
 
@@ -110,28 +110,28 @@ def join_profiles(
 
     Args:
         phases: Durations of the phases of each problem and joint, shape (K, dof, P) [s].
-        jerks: Jerks in them, likewise [rad/s^3].
-        starts: Times at which the problems begin and the last one ends, shape (K + 1,) [ticks].
+        jerks: Jerks in them, shape (K, dof, P) [rad/s^3].
+        starts: Times at which the problems start and the last one ends, shape (K + 1,) [ticks].
         states: Positions, velocities and accelerations between which they go, shape (3, K + 1, dof).
-        begins: Room for the beginnings of pieces, shape (K, dof, P + SPLITS - 1).
-        pieces: Room for their states and jerks, shape (4, K, dof, P + SPLITS - 1).
-        merged: Room for the beginnings of a problem's pieces, shape (dof (P + SPLITS - 1),).
+        edges: Buffer for the starts of pieces, shape (K, dof, P + SPLITS - 1).
+        pieces: Buffer for their states and jerks, shape (4, K, dof, P + SPLITS - 1).
+        merged: Buffer for the starts of a problem's pieces, shape (dof (P + SPLITS - 1),).
         times: Gets the times of the knots, shape (K dof (P + SPLITS - 1) + 1,) [s].
         knots: Gets positions, velocities and accelerations at them, shape (3, that, dof).
 
     Returns:
         The number of knots.
     """
-    problems, dof, size = begins.shape
+    problems, dof, size = edges.shape
     count = 0
     for k in range(problems):
         first, last = starts[k], starts[k + 1]
         for j in range(dof):
-            _lay_pieces(phases, jerks, first, last, k, j, begins, pieces)
-            _correct(states, last, k, j, begins, pieces)
-            _integrate(states, last, k, j, begins, pieces)
+            _lay_pieces(phases, jerks, first, last, k, j, edges, pieces)
+            _correct(states, last, k, j, edges, pieces)
+            _integrate(states, last, k, j, edges, pieces)
             for p in range(size):
-                merged[j * size + p] = begins[k, j, p]
+                merged[j * size + p] = edges[k, j, p]
         _sort(merged, dof * size)
         distinct = 0
         for i in range(dof * size):
@@ -141,9 +141,9 @@ def join_profiles(
         for j in range(dof):
             p = 0
             for i in range(distinct):
-                while p + 1 < size and begins[k, j, p + 1] <= merged[i]:
+                while p + 1 < size and edges[k, j, p + 1] <= merged[i]:
                     p += 1
-                t = (merged[i] - begins[k, j, p]) * TICK
+                t = (merged[i] - edges[k, j, p]) * TICK
                 v, a, jerk = pieces[1, k, j, p], pieces[2, k, j, p], pieces[3, k, j, p]
                 knots[0, count + i, j] = pieces[0, k, j, p] + t * (v + t * (a / 2.0 + t * jerk / 6.0))
                 knots[1, count + i, j] = v + t * (a + t * jerk / 2.0)
