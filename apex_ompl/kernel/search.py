@@ -58,7 +58,7 @@ class SearchBuffers:
     """
 
     def __init__(self, kernel: Kernel, longest: float, resolution: float) -> None:
-        """Allocate buffers for motions up to ``longest`` [rad, max-norm] whose states are ``resolution`` apart [rad]."""
+        """Allocate buffers for motions up to ``longest`` [rad, max-norm] with states ``resolution`` apart [rad]."""
         dof, steps = kernel.robot.dof, math.ceil(longest / resolution) + 1
         self.workspace = kernel.workspace()
         self._counts: NDArray[np.int64] = np.zeros(5, np.int64)

@@ -161,7 +161,7 @@ class _Search:
         left = motion.duration - time
         self.stages = int(np.clip(math.ceil(left / STAGE), *STAGES))
         self.length = left / self.stages
-        self.points: Array = time + self.length * np.arange(self.stages + 1)
+        self.points: Array = np.asarray(time + self.length * np.arange(self.stages + 1), float)
         edges = self.points[:-1, None] + self.length / PIECES * np.arange(PIECES)
         edges = np.append(edges.ravel(), self.points[-1])
         where = np.stack([edges[:-1], edges[1:]], axis=1), np.stack([self.points, self.points], axis=1)
