@@ -53,7 +53,7 @@ class Curve:
         knots: Increasing parameters of the states, shape (K,): lengths [rad], or times [s].
         states: Shape (K, dof).
         rates: Velocities and accelerations side by side, shape (K, 2 dof); (0, 2 dof) for straight lines.
-        slack: What the pieces miss each other by, by rounding, in all [rad].
+        slack: Sum of the gaps between the pieces, by rounding [rad].
     """
 
     knots: Array

@@ -45,8 +45,8 @@ class RobotArrays(NamedTuple):
     number of ranges per unit, or 0. ``part_lazy`` are the inner joints of a part, ``part_bodies`` its bodies.
 
     A node is a sphere (``node_center`` in the frame of its body's joint, ``node_radius``) around the part of the solid
-    that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` says which of
-    ``inner_ball`` are inside of a body's solid, in the frame of its joint.
+    that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` are the first
+    and number of those of ``inner_ball`` that are inside of a body's solid, in the frame of its joint.
 
     ``pair_ball`` holds, for both clusters of a pair, what ``cluster_ball`` does, around the bodies alone that the pair
     is about, ``pair_outer`` the radius around their leaf spheres: fingers are checked against a wrist, the palm, which
@@ -105,7 +105,7 @@ class SceneArrays(NamedTuple):
 
     ``kind`` is one of BOX ... HALF_SPACE or GRID, ``owner`` the number of the obstacle that a solid is part of.
     ``size`` holds half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its
-    distance in ``size``. ``exact`` says whether it is the shape of that part and not only contains it. A grid has its
+    distance in ``size``. ``exact`` is 1 where it is the shape of that part, 0 where it only contains it. A grid has its
     first node at ``offset``, and in ``size`` its spacing, by how much its values were lowered, and the radius of the
     balls around points. ``grid`` says which of ``values`` are its own: the first, and how many along each axis; then
     where the tree over its points or triangles starts, its levels, and the number of these and of the numbers of each,

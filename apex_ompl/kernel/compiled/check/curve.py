@@ -95,7 +95,7 @@ def set_motion(
         knots: Parameters, shape (K,).
         states: States, shape (K, dof).
         rates: Velocities and accelerations side by side, shape (K, 2 dof), or (0, 2 dof) for a polyline.
-        slack: What the pieces miss each other by, by rounding, in all.
+        slack: Sum of the gaps between the pieces, by rounding.
         a: Start of the interval.
         b: Its end.
         middle: State in its middle, shape (dof,).

@@ -152,7 +152,7 @@ def _by_shapes(
     t: RobotArrays, w: Workspace, h: ShapeArrays, rows: Integers, g: PairBuffers, p: ProofBuffers,
     a: float, b: float, count: int, shortest: float, touch: float, tolerance: float,
 ) -> int:  # fmt: skip
-    """Look at the pairs in ``found`` by their shapes; append both halves of the interval for those that stay open.
+    """Bound the pairs in ``found`` by their shapes; append both halves of the interval for those that stay open.
 
     Returns:
         PROVED, TOUCHING or UNDECIDED.

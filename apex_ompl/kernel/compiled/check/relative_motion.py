@@ -28,7 +28,7 @@ from apex_ompl.kernel.compiled.layout import Floats, Integers
 
 
 class Frames(NamedTuple):
-    """What the motion of pairs needs of a robot and of the buffers of a state, with their names."""
+    """Arrays of a robot and of the buffers of a state that bound the relative motion of pairs."""
 
     joint_parent: Integers
     joint_kind: Integers

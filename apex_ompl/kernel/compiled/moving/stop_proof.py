@@ -84,7 +84,7 @@ def first_unproved_stop(
         knots: Times of the motion, as are the next three; see :func:`apex_ompl.kernel.compiled.check.curve.set_motion`.
         states: States at the knots.
         rates: Velocities and accelerations at the knots.
-        slack: What the pieces miss each other by.
+        slack: Sum of the gaps between the pieces.
         motion: Positions, velocities and accelerations at the knots, shape (3, K, dof).
         lower: Lowest positions of stops, shape (dof,) [rad].
         upper: Highest positions, shape (dof,) [rad].

@@ -202,7 +202,7 @@ def add_speed(
 
 
 class PathProblem(NamedTuple):
-    """What the cost of a path needs: where its samples are, and how its speed counts.
+    """Data of the cost of a path: weights at its samples, and the matrix of its speed.
 
     Attributes:
         weights: Weights of control points at the samples, shape (N, degree + 1).

@@ -43,7 +43,7 @@ Problem = Any
 
 @reassociating_inlined
 def _eliminate(factor: Floats, first: int, last: int, k: int, end: int) -> bool:
-    """Finish row ``k`` of a Cholesky factor: take away what rows ``first`` to ``last`` have in it."""
+    """Finish row ``k`` of a Cholesky factor: subtract the products of rows ``first`` to ``last``."""
     source = factor[k, k:end]
     for m in range(first, last):
         f, row = factor[m, k], factor[m, k:end]
@@ -59,7 +59,7 @@ def _eliminate(factor: Floats, first: int, last: int, k: int, end: int) -> bool:
 
 @reassociating_inlined
 def _take_away(factor: Floats, k: int, last: int, end: int, panel: Floats) -> None:
-    """Take away what the BLOCK rows from ``k`` on have in the rows below, up to ``end``.
+    """Subtract the products of the BLOCK rows from ``k`` on from the rows below, up to ``end``.
 
     Pieces of the rows are copied next to each other: between rows whose distance is a constant no test is needed of
     whether they overlap, nor, with indices that cannot be negative, of where they start.
@@ -180,7 +180,7 @@ def descend(
     Args:
         evaluate: Compiled function ``(problem, t, s, w, pinned, control, settings, b, gradient, gram)`` that returns
             the cost of control points, and puts gradient and matrix into place.
-        problem: What it needs besides.
+        problem: Its data.
         t: The robot.
         s: The scene.
         w: Workspace.

@@ -135,7 +135,7 @@ def relative_gap(knots: Floats, positions: Floats, velocities: Floats, accelerat
 
 @entry_point
 def cubic_rates(knots: Floats, positions: Floats, velocities: Floats, accelerations: Floats, rates: Floats) -> float:
-    """Return what the pieces of a motion miss each other by, in all, for proofs along them [rad].
+    """Return the sum of the gaps between the pieces of a motion, for proofs along them [rad].
 
     Args:
         knots: Times of the knots, two or more.

@@ -25,7 +25,7 @@ def _sort(values: Integers, count: int) -> None:
 def _lay_pieces(
     phases: Floats, jerks: Floats, first: int, last: int, k: int, j: int, edges: Integers, pieces: Floats
 ) -> None:
-    """Write the beginnings of the pieces of a profile [ticks], phases and splits alike, and their jerks."""
+    """Write the starts of the pieces of a profile [ticks], phases and splits alike, and their jerks."""
     count, size = phases.shape[2], phases.shape[2] + SPLITS - 1
     end = first * TICK
     for p in range(count):
