@@ -229,19 +229,18 @@ class PathCheck:
         last = int(motion_proof.lay_grid(path, resolution, starts))
         if last < 0:
             return last
-        if len(self._queue) < 2 * last + 4:
-            self._queue = np.empty((2 * last + 4, 2), np.int64)
+        queue = self._queue if len(self._queue) >= 2 * last + 4 else np.empty((2 * last + 4, 2), np.int64)
         entered = [*((last, last) if k < 0 else (0, 0) for k in states), (0, last)]
-        self._queue[: len(entered)] = entered
+        queue[: len(entered)] = entered
         self._ends[:2] = 0, len(entered)
         self._counts[:] = 0
-        self._path, self._starts = path, starts
+        self._path, self._starts, self._open = path, starts, queue
         return last
 
     def first_unproved(self, kernel: Kernel) -> int | None:
         """Return the number on the grid of the next state that is not proved free, which is in ``state``, or None."""
         number = motion_proof.prove_path(
-            *kernel.packed, *self._workspace, self._path, self._starts, self._queue, self._ends, self.state, self.pairs,
+            *kernel.packed, *self._workspace, self._path, self._starts, self._open, self._ends, self.state, self.pairs,
             self._counts,
         )  # fmt: skip
         return None if number == motion_proof.DONE else int(number)
