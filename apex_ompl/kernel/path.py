@@ -6,14 +6,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.layout import Integers
+from apex_ompl.kernel.compiled.layout import Integers, new_buffers
 from apex_ompl.kernel.compiled.path import path_cost as compiled_cost
 from apex_ompl.kernel.compiled.path import path_optimization
 from apex_ompl.kernel.compiled.path.path_cost import CostSettings, PathReport
+from apex_ompl.kernel.compiled.path.path_optimization import LEAST_DAMPING, MOST_DAMPING
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.types import Array
 
-__all__ = ["CostSettings", "PathGrid", "PathReport", "optimization_buffers", "optimize_path", "path_cost"]
+__all__ = [
+    "LEAST_DAMPING",
+    "MOST_DAMPING",
+    "CostSettings",
+    "PathGrid",
+    "PathReport",
+    "optimization_buffers",
+    "optimize_path",
+    "path_cost",
+]
 
 
 class PathGrid(NamedTuple):
@@ -37,10 +47,11 @@ def optimization_buffers(pinned: int, points: int, dof: int) -> tuple[Integers, 
 
 
 def path_cost(
-    kernel: Kernel, grid: PathGrid, pinned: int, control: Array, settings: CostSettings,
-    buffers: tuple[Integers, Array], gradient: Array,
-) -> PathReport:  # fmt: skip
-    """Return the cost of a path, see :mod:`apex_ompl.kernel.compiled.path.path_cost` for the formula.
+    kernel: Kernel, grid: PathGrid, pinned: int, control: Array, settings: CostSettings
+) -> tuple[PathReport, Array, Array]:
+    """Return the cost of a path, its gradient, shape (n,), and its Gauss-Newton matrix, shape (n, n).
+
+    The formula is that of :mod:`apex_ompl.kernel.compiled.path.path_cost`; the n unknowns are the free control points.
 
     Args:
         kernel: The robot among its obstacles.
@@ -48,14 +59,16 @@ def path_cost(
         pinned: Number of control points at each end that stay.
         control: Control points, shape (P, dof).
         settings: Margins and stiffness.
-        buffers: Memory of :func:`optimization_buffers`.
-        gradient: Gets the gradient by the free control points, shape ((P - 2 pinned) dof,).
     """
-    return PathReport(
-        *compiled_cost.path_cost(
-            *kernel.packed, *kernel.workspace(), *grid, pinned, control, tuple(settings), *buffers, gradient
-        )
+    points, dof = control.shape
+    unknowns = (points - 2 * pinned) * dof
+    integers, floats, buffers = new_buffers(compiled_cost.Buffers, unknowns=unknowns, points=points, dof=dof)
+    gradient = np.empty(unknowns)
+    report = compiled_cost.path_cost(
+        *kernel.packed, *kernel.workspace(), *grid, pinned, control, tuple(settings), integers, floats, gradient
     )
+    upper = np.triu(buffers.gram[0])
+    return PathReport(*report), gradient, upper + np.triu(upper, 1).T
 
 
 def optimize_path(

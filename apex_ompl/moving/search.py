@@ -17,7 +17,7 @@ from apex_ompl.moving.request import Request
 from apex_ompl.moving.timed_spline import MotionOptimizer, MotionSettings, Start
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
-from apex_ompl.timing.moving_start import between
+from apex_ompl.timing.ruckig_method import between
 from apex_ompl.types import Array
 
 MOTIONS = MotionSettings(samples=2)

@@ -36,7 +36,7 @@ from apex_ompl.moving.following import Following
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
 from apex_ompl.problems.worlds import World
-from apex_ompl.timing.rests import is_at_rest
+from apex_ompl.timing.trajectory import is_at_rest
 
 
 class BadEyes:

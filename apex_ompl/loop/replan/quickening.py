@@ -9,7 +9,7 @@ import numpy as np
 
 from apex_ompl.moving.search import Search
 from apex_ompl.timing import Trajectory
-from apex_ompl.timing.moving_start import through
+from apex_ompl.timing.ruckig_method import through
 
 TRIES = ((2, 1.25), (3, 1.25), (2, 1.0), (4, 1.1), (3, 1.0))  # numbers of pieces, and factors on the speed between them
 SHARE = 0.98  # of the limits that speeds and accelerations between pieces have at most
