@@ -18,6 +18,8 @@ From the top, as CONTRIBUTING has it:
 9. `collision`: the checker, spheres before meshes; `paths`: splines, the optimizer; `robot`: Pinocchio models, MoveIt's
    files.
 10. `kernel`: wrappers of compiled code over flat arrays; `scene`: problem files and bodies; `util`, `types`, `errors`.
+    `planners/` and `problems/` stand at the top because that is where users of OMPL look for them; `apex_ompl/planners`
+    and `apex_ompl/problems` are links to them, so that both import as parts of the package.
 """
 
 from __future__ import annotations
