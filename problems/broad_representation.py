@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled.cloud_distance import primitive_distances
+from apex_ompl.kernel.geometry import primitive_distances
 from apex_ompl.problems.broad_parts import BOX, CAPSULE, CYLINDER, Part, kernel_columns
 from apex_ompl.scene.bodies import Obstacle, pose_fields
 from apex_ompl.types import Array
@@ -38,10 +38,12 @@ MOST_PARTS = 80  # of a mesh
 
 def distances(parts: Sequence[Part], points: Array) -> Array:
     """Return the signed distances of points, shape (n, 3), to each part, shape (parts, n) [m]."""
-    found = np.empty((len(parts), len(points)))
-    for k, (kind, rotation, offset, size) in enumerate(zip(*kernel_columns(parts), strict=True)):
-        primitive_distances(np.ascontiguousarray((points - offset) @ rotation), int(kind), size, found[k])
-    return found
+    columns = zip(*kernel_columns(parts), strict=True)
+    rows = [
+        primitive_distances(np.ascontiguousarray((points - offset) @ rotation), int(kind), size)
+        for kind, rotation, offset, size in columns
+    ]
+    return np.array(rows).reshape(len(parts), len(points))
 
 
 def triangles(part: Part) -> tuple[Array, NDArray[np.int64]]:

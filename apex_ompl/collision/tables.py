@@ -28,7 +28,7 @@ from apex_ompl.collision.inner_balls import inner_balls
 from apex_ompl.collision.shapes import cloud_of, is_shell, is_surface
 from apex_ompl.collision.solids import Solid
 from apex_ompl.errors import RobotError
-from apex_ompl.kernel.compiled.arrays import (
+from apex_ompl.kernel.arrays import (
     BOX,
     CAPSULE,
     CYLINDER,
@@ -38,9 +38,10 @@ from apex_ompl.kernel.compiled.arrays import (
     REVOLUTE,
     SPHERE,
     RobotArrays,
+    ShapeArrays,
+    pack,
+    unpack,
 )
-from apex_ompl.kernel.compiled.layout import pack, unpack
-from apex_ompl.kernel.compiled.shapes import ShapeArrays
 from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_builder import robot_tables

@@ -9,8 +9,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.ahead_of_time import compile_ahead
-from apex_ompl.kernel.compiled.entry_points import RUNS
+from apex_ompl.kernel.ahead_of_time import compile_for_runs
 from apex_ompl.moving.charges import Charges
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
 from apex_ompl.moving.following import Following
@@ -43,7 +42,7 @@ class Ready:
 
     def __post_init__(self) -> None:
         """Compile what runs need, where that was not done yet."""
-        compile_ahead(RUNS)
+        compile_for_runs()
 
     @property
     def checker(self) -> CollisionChecker:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.blocked_intervals import MOST_SPANS, blocked_intervals
+from apex_ompl.kernel.moving import blocked_intervals
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
@@ -19,7 +19,7 @@ class Blocked(NamedTuple):
 
     Attributes:
         places: Begins and ends of the places, in the motion's own time, shape (P, 2) [s].
-        spans: Their intervals in order, shape (P, MOST_SPANS, 2) [s of the dynamic obstacles' stamps].
+        spans: Their intervals in order, shape (P, most, 2) [s of the dynamic obstacles' stamps].
         counts: Numbers of them, shape (P,).
     """
 
@@ -60,10 +60,4 @@ def blocked(
         end: The last one [s].
         slack: Distance from the path, of each joint, that counts as being on it [rad].
     """
-    curve, dof = curve_of(motion), motion.dof
-    spans, counts = np.zeros((len(places), MOST_SPANS, 2)), np.empty(len(places), np.int64)
-    blocked_intervals(
-        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates,
-        curve.slack + slack, places, float(begin), float(end), np.empty(dof), spans, counts,
-    )  # fmt: skip
-    return Blocked(places, spans, counts)
+    return Blocked(places, *blocked_intervals(kernel, dynamic.packed, curve_of(motion), places, (begin, end), slack))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair
 from apex_ompl.moving.placing import fresh_checker, place_nearest
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.search import STATES, Guess, Search, least_duration
