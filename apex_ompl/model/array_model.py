@@ -278,7 +278,7 @@ def _silu(values: Single) -> Single:
 
 def _normalized(values: Single) -> Single:
     """Return rows shifted and scaled to mean 0 and variance 1."""
-    centerd = values - values.mean(axis=-1, keepdims=True)
-    variance = np.square(centerd).mean(axis=-1, keepdims=True)
-    found: Single = centerd / np.sqrt(variance + np.float32(EPSILON))
+    centered = values - values.mean(axis=-1, keepdims=True)
+    variance = np.square(centered).mean(axis=-1, keepdims=True)
+    found: Single = centered / np.sqrt(variance + np.float32(EPSILON))
     return found

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def cup_obj(radius: float = 0.04, wall: float = 0.004, height: float = 0.13, sides: int = 24) -> str:
-    """Return a cup as OBJ text: a closed surface around z, opening towards +z, centerd on the origin."""
+    """Return a cup as OBJ text: a closed surface around z, opening towards +z, centered on the origin."""
     low, high, inner = -height / 2, height / 2, radius - wall
     profile = [(0.0, low), (radius, low), (radius, high), (inner, high), (inner, low + wall), (0.0, low + wall)]
     return _lathe(profile, sides)
@@ -36,7 +36,7 @@ def _lathe(profile: Sequence[tuple[float, float]], sides: int) -> str:
 
 
 def block_obj(edge: float = 0.08, hole: float = 0.042, depth: float = 0.07, floor: float = 0.01) -> str:
-    """Return a block with a square blind hole as OBJ text, opening towards +z, centerd on the origin."""
+    """Return a block with a square blind hole as OBJ text, opening towards +z, centered on the origin."""
     low, high = -depth / 2, depth / 2
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     levels = [(edge / 2, low), (edge / 2, high), (hole / 2, high), (hole / 2, low + floor)]
