@@ -21,7 +21,7 @@ import math
 from typing import Any
 
 import record
-from attack_worlds import KIND, SUITES, AttackWorld
+from attack_worlds import KIND, SUITES, AttackEnvironment
 from closed_loop import FOLDER, SCRIPTED, Job, kept, made_by, stored
 
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
@@ -55,7 +55,7 @@ def made(job: Job) -> dict[str, Any]:
     method = job.method.partition("+")[0]
     if kind_of(job.world) != KIND:
         return kept(job, run(job.world, method, speed=job.speed, seed=0, settings=settings))
-    world = AttackWorld(number, FOLDER.with_name("guarded_runs"))
+    world = AttackEnvironment(number, FOLDER.with_name("guarded_runs"))
     return kept(job, run(world, method, speed=job.speed, seed=0, settings=settings, sensor=world.sensor))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.problems.worlds import World
+from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import fastest, is_there, obstacle_at, recorded
@@ -14,7 +14,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number
 
 
-class ScriptedWorld(World):
+class ScriptedEnvironment(DynamicEnvironment):
     """A world of obstacles with a velocity or a script.
 
     Attributes:
@@ -36,7 +36,7 @@ class ScriptedWorld(World):
         self._obstacles = obstacles
         self._now = 0.0
 
-    def begin(self, motion: Trajectory, time: float) -> None:
+    def start(self, motion: Trajectory, time: float) -> None:
         """Take the first motion, and when it begins [s].
 
         Raises:
@@ -73,7 +73,7 @@ class ScriptedWorld(World):
         return self._obstacles
 
 
-def moving_world(problem: Problem) -> ScriptedWorld:
+def environment_of(problem: Problem) -> ScriptedEnvironment:
     """Return the world of a problem's own obstacles, which do what their records say whatever the robot does.
 
     Obstacles with a velocity go on for ever.
@@ -85,4 +85,4 @@ def moving_world(problem: Problem) -> ScriptedWorld:
     if touching is not None:
         raise ParameterError("allowed", touching, "no obstacle that moves in a pair that may touch")
     dynamic = tuple(o for o in problem.scene if o.moving)
-    return ScriptedWorld(problem.name, problem.still, dynamic, max(map(fastest, dynamic), default=0.0))
+    return ScriptedEnvironment(problem.name, problem.still, dynamic, max(map(fastest, dynamic), default=0.0))

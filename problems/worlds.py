@@ -41,10 +41,10 @@ GENERATED = ("popup", "interceptor", "turning", "crowd", "pusher")
 SEED = re.compile(r"0|[1-9][0-9]{0,19}")
 
 
-class World(ABC):
+class DynamicEnvironment(ABC):
     """What truly happens in a run.
 
-    A run calls ``begin`` once, when its first motion is committed, and ``advance`` at every step of its clock, with
+    A run calls ``start`` once, when its first motion is committed, and ``advance`` at every step of its clock, with
     times that increase from 0; ``present`` may be asked about any time up to the last step.
 
     Attributes:
@@ -63,7 +63,7 @@ class World(ABC):
         """Return the name of the world, and whether a run was made in it."""
         return one_line(type(self).__name__, repr(self.name), "ran" if self.ran else "")
 
-    def begin(self, motion: Trajectory, time: float) -> None:  # noqa: B027 - most worlds do not care
+    def start(self, motion: Trajectory, time: float) -> None:  # noqa: B027 - most worlds do not care
         """Take the first motion that the robot is to follow, and when it begins [s]."""
 
     def advance(self, time: float, q: Array) -> None:  # noqa: B027
@@ -155,7 +155,7 @@ def ids(kind: str, split: str, count: int) -> tuple[str, ...]:
     return tuple(name if kind == MOVING_KIND else f"{kind}/{name}" for name in islice(every, count))
 
 
-def load(name: str) -> World:
+def load(name: str) -> DynamicEnvironment:
     """Return a world, new at each call, by its name, that of a problem, or a problem file.
 
     Raises:
@@ -164,32 +164,32 @@ def load(name: str) -> World:
         SuiteError: No problem or no place for a cube can be drawn for that seed.
         ApexError: A problem file, or a file that it names, is faulty.
     """
-    from apex_ompl.problems.world_scripts import moving_world
+    from apex_ompl.problems.world_scripts import environment_of
 
     kind, *rest = name.split("/")
     if name.endswith((".yaml", ".yml")) or Path(name).is_absolute():
-        return moving_world(Problem.load(name))
+        return environment_of(Problem.load(name))
     if kind not in GENERATED and (problems.is_id(name) or name in problems.names()):
-        return moving_world(problems.load(name))
+        return environment_of(problems.load(name))
     if not rest:
         known = (f"{one}/vertical/large/12" for one in GENERATED)
         raise UnknownNameError("world", name, (*problems.names(), *known))
     return _drawn(WorldId.parse(name))
 
 
-def _drawn(world: WorldId) -> World:
+def _drawn(world: WorldId) -> DynamicEnvironment:
     """Return the world of an id."""
-    from apex_ompl.problems.world_ambushes import InterceptorWorld, PopupWorld
-    from apex_ompl.problems.world_pusher import PusherWorld
-    from apex_ompl.problems.world_wanderers import WanderersWorld
+    from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment
+    from apex_ompl.problems.world_pusher import PusherEnvironment
+    from apex_ompl.problems.world_wanderers import WanderersEnvironment
 
     level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())
     rng = np.random.default_rng([level, world.seed])
     name, problem, edge = str(world), problems.load(str(world.problem)), SIZES[world.size]
     if world.kind == "popup":
-        return PopupWorld(name, problem, edge, rng)
+        return PopupEnvironment(name, problem, edge, rng)
     if world.kind == "interceptor":
-        return InterceptorWorld(name, problem, edge, rng)
+        return InterceptorEnvironment(name, problem, edge, rng)
     if world.kind == "pusher":
-        return PusherWorld(name, problem, edge, rng)
-    return WanderersWorld(name, problem, edge, rng, turns=world.kind == "turning")
+        return PusherEnvironment(name, problem, edge, rng)
+    return WanderersEnvironment(name, problem, edge, rng, turns=world.kind == "turning")

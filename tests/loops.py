@@ -21,8 +21,8 @@ from apex_ompl.moving.request import Answer, Request
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.moving.timed_spline import Start, TimedSpline
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.problems.world_scripts import moving_world
-from apex_ompl.problems.worlds import World
+from apex_ompl.problems.world_scripts import environment_of
+from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.spline_method import least_knot_spacing
@@ -80,10 +80,10 @@ def ready_of(name: str, *, speed: float = 1.0, **parameters: Any) -> Ready:
     return Ready(setup, limits, limits, settings)
 
 
-def world_of(name: str, *obstacles: Obstacle) -> World:
+def world_of(name: str, *obstacles: Obstacle) -> DynamicEnvironment:
     """A problem's world with obstacles that move."""
     problem = problems.load(name).still
-    return moving_world(problem.model_copy(update={"scene": (*problem.scene, *(obstacles or (FAR,)))}))
+    return environment_of(problem.model_copy(update={"scene": (*problem.scene, *(obstacles or (FAR,)))}))
 
 
 def go(

@@ -35,14 +35,14 @@ from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_ti
 from apex_ompl.moving.following import Following
 from apex_ompl.moving.ready import Ready
 from apex_ompl.moving.request import Answer, Request
-from apex_ompl.problems.worlds import World
+from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.timing.rests import is_at_rest
 
 
 class BadEyes:
     """A sensor whose observations are doubled, out of order, late by turns, or not numbers."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: DynamicEnvironment) -> None:
         self._eyes = SensorStream(Sensor(), world, 0.3)
 
     def observations(self, until: float) -> list[Observation]:
