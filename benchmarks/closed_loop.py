@@ -38,7 +38,7 @@ from apex_ompl import plan, problems
 from apex_ompl.loop.replan.methods import METHODS
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import CLOCKS, run
-from apex_ompl.moving.charges import cost_table
+from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.problems import worlds
 from apex_ompl.timing.parameterization import Timing
 from apex_ompl.util import provenance

@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loops import FAR, PROBLEM, ByHand, line, ready_of, world_of
+from loops import FAR, PROBLEM, ByHand, line, context_of, world_of
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.loop.cycle import Loop, RunRecord
-from apex_ompl.loop.late_steps import Decided, undo
-from apex_ompl.loop.observation import Observation
-from apex_ompl.loop.replanning import AtOnce
+from apex_ompl.loop.clocks import simulate
+from apex_ompl.loop.cycle import Decided, Loop, RunRecord, undo
+from apex_ompl.loop.environment import Observation
+from apex_ompl.loop.replanning import ImmediateReplanning
 from apex_ompl.loop.result import INTERRUPTED
 from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.loop.simulation import simulate
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.scene.scripts import place_at
@@ -28,9 +27,9 @@ PERIOD, NAN = LoopSettings.period, float("nan")
 
 
 def loop_of(replanner: Any, sensor: Sensor | None = None, **parameters: Any) -> Loop:
-    ready, world = ready_of(PROBLEM, **parameters), world_of(PROBLEM)
-    eyes = SensorStream(sensor or Sensor(), world, ready.settings.watched)
-    return Loop(world, ready, AtOnce(ready, replanner), eyes, seed=0)
+    context, world = context_of(PROBLEM, **parameters), world_of(PROBLEM)
+    eyes = SensorStream(sensor or Sensor(), world, context.settings.watched)
+    return Loop(world, context, ImmediateReplanning(context, replanner), eyes, seed=0)
 
 
 def steps(loop: Loop) -> Iterator[tuple[float, Decided, RunRecord | None]]:
@@ -108,7 +107,7 @@ def test_obstacles_that_count_as_standing_are_told_without_a_velocity() -> None:
 def test_the_filter_knows_how_much_a_sensor_errs() -> None:
     """With the noise of the default sensor it would take most of the errors of this one for turns, and begin anew."""
     sensor = Sensor(noise=0.03)
-    loop = loop_of(ByHand(lambda ready, request: None), sensor, error=sensor.largest_error, timeout=1.0)
+    loop = loop_of(ByHand(lambda context, request: None), sensor, error=sensor.largest_error, timeout=1.0)
     for _ in steps(loop):
         pass
     assert loop.executor.tracker.settings.noise == pytest.approx(0.03)
@@ -145,8 +144,8 @@ WATCHED = 10  # looks before the run
 
 def seen_by(eyes: Any, **parameters: Any) -> RunRecord:
     """A run with a sensor made by hand."""
-    ready, world = ready_of(PROBLEM, **{"timeout": 1.0, **parameters}), world_of(PROBLEM, NEAR)
-    return simulate(world, ready, ByHand(line), eyes, seed=0)
+    context, world = context_of(PROBLEM, **{"timeout": 1.0, **parameters}), world_of(PROBLEM, NEAR)
+    return simulate(world, context, ByHand(line), eyes, seed=0)
 
 
 def nowhere(k: int, one: Observation) -> Observation:

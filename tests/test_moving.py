@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.moving.swept import check_timed_path, constant_velocity_times, inflated
+from apex_ompl.moving.timed_proof import check_timed_path, constant_velocity_times, inflated
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem

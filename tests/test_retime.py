@@ -13,8 +13,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, prove_motion
-from apex_ompl.moving.retime import retime
-from apex_ompl.moving.safe_intervals import Blocked, blocked
+from apex_ompl.moving.retime import Blocked, blocked, retime
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle

@@ -21,7 +21,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import run as bench_run
-from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.moving.timed_proof import check_timed_path
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.planning import MotionPlanner
 from apex_ompl.result import PlanResult

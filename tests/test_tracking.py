@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.loop.observation import Observation
+from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.tracking import LEAST, MOST_DOUBTED, MOST_TRACKS, Track, Tracker, TrackSettings
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
 from apex_ompl.problems.suite_robot import robot as suite_robot

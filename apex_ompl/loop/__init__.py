@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.loop.observation import Observation
+    from apex_ompl.loop.environment import Observation
     from apex_ompl.loop.result import Event, Outcome, RunResult
     from apex_ompl.loop.sensor import Sensor, SensorStream
 
@@ -17,7 +17,7 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Event": "result",
-        "Observation": "observation",
+        "Observation": "environment",
         "Outcome": "result",
         "RunResult": "result",
         "Sensor": "sensor",

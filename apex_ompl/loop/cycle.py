@@ -5,33 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
+from apex_ompl.loop.environment import Environment, Observation, ObservationSource
 from apex_ompl.loop.executor import Executor
-from apex_ompl.loop.late_steps import Decided, undo
-from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.result import INTERRUPTED, Event
 from apex_ompl.loop.sensor import CUT
 from apex_ompl.loop.tracking import Tracker, TrackSettings, as_they_are
+from apex_ompl.moving.context import SAME_TIME, Following, RunContext, executed
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
-from apex_ompl.moving.following import SAME_TIME, Following, executed
-from apex_ompl.moving.ready import Ready
-from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at, vector
 from apex_ompl.timing import Trajectory
 
 LONGEST_STOP = 5.0  # behind which a run ends that does not come to rest when the time is up [s]
-
-
-class Eyes(Protocol):
-    """What observes a world."""
-
-    def observations(self, until: float) -> Iterable[Observation]:
-        """Return the observations with stamps up to a time [s] that were not returned before, in their order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,30 +68,30 @@ class Loop:
     """
 
     def __init__(
-        self, world: World, ready: Ready, replanning: Replanning, eyes: Eyes, seed: int, *, lead: float = 0.0
+        self, environment: Environment, context: RunContext, replanning: Replanning, sensor: ObservationSource, seed: int, *, lead: float = 0.0
     ) -> None:  # fmt: skip
         """Begin with a robot that stands at the start.
 
         Args:
             world: What truly happens.
-            ready: The robot among what stands still.
+            context: The robot among what stands still.
             replanning: Who plans motions anew.
             eyes: What observes the world.
             seed: Of random choices.
             lead: How long before a step it is decided [s].
         """
-        self._world, self._ready, self._eyes = world, ready, eyes
-        self._allowed = tuple(ready.setup.problem.allowed)
-        error, fastest = ready.settings.assumed
-        self._present: tuple[Obstacle, ...] = tuple(world.present(0.0))
+        self._environment, self._ready, self._sensor = environment, context, sensor
+        self._allowed = tuple(context.setup.problem.allowed)
+        error, fastest = context.settings.assumed
+        self._present: tuple[Obstacle, ...] = tuple(environment.present(0.0))
         self._tracker = Tracker(
-            ready.kernel, TrackSettings(noise=error / CUT), self._allowed, error, fastest, ready.settings.memory,
+            context.kernel, TrackSettings(noise=error / CUT), self._allowed, error, fastest, context.settings.memory,
             {o.name for o in self._present},
         )  # fmt: skip
-        start = ready.setup.start
-        standing = Following.standing(start, 0.0, ready.names, to_goal=ready.is_goal(start))
+        start = context.setup.start
+        standing = Following.standing(start, 0.0, context.names, to_goal=context.is_goal(start))
         self.executor = Executor(
-            ready, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
+            context, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
         )  # fmt: skip
         self._waiting: list[Observation] = []
         self._begun, self._rest, self._broken, self._refused, self._doubted = False, 0.0, 0, 0, 0
@@ -109,13 +99,13 @@ class Loop:
 
     def advance(self, now: float) -> None:
         """Let the world move on to a time [s], and be looked at."""
-        self._world.advance(now, self.executor.state(now))
+        self._environment.advance(now, self.executor.state(now))
         if not self._aborted:
             try:
-                self._waiting += self._eyes.observations(now)
+                self._waiting += self._sensor.observations(now)
             except Exception as error:  # whatever a sensor does, the robot stops and the run is returned
                 self.abort(f"the sensor failed, {type(error).__name__}: {error}")
-        self._present, self._looked = tuple(self._world.present(now)), now
+        self._present, self._looked = tuple(self._environment.present(now)), now
 
     def abort(self, why: str = "the interpreter ended") -> None:
         """Let the robot stop, and the run end for a reason; may be called from any thread."""
@@ -176,11 +166,11 @@ class Loop:
         over = executor.closed and (executor.following.at_rest(now) or now >= self._closed + LONGEST_STOP)
         return self._ended(now, False, "aborted" if self._aborted else "timeout") if over else None
 
-    def set_out(self, now: float) -> None:
+    def announce_start(self, now: float) -> None:
         """Tell the world of the first motion, where there is one by a time [s], that of the last step."""
         route = self.executor.route
         if not self._begun and route is not None:
-            self._world.begin(route.motion, max(route.begin, now))
+            self._environment.start(route.motion, max(route.start_time, now))
             self._begun = True
 
     def _records(self, predicted: DynamicObstacles, now: float) -> tuple[Obstacle, ...]:
@@ -215,3 +205,65 @@ def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float) -> boo
         if not any(tracker.may_be(track, o, now, errors=1) for track in known):
             return True
     return False
+
+
+DECISIONS = (
+    "route", "leaving", "aside", "departure", "nearest", "ending", "conflict", "contact", "conflict_since", "ahead", "doing",
+    "braking",
+)  # fmt: skip
+"""Attributes of an executor that go with what it follows."""
+TAKEN = {"accepted": "rejected", "improved": "kept"}
+"""Kinds of events of answers that were taken, and of those that came to nothing."""
+UNSAID = ("stop", "reaction", "conflict")
+"""Kinds of events that are undone with a step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """What an executor had decided before a step, so that the step can be undone.
+
+    Attributes:
+        following: What the robot followed.
+        stop: The stop in hand.
+        events: Number of events.
+        others: The attributes ``DECISIONS`` by name.
+    """
+
+    following: Following
+    stop: Following | None
+    events: int
+    others: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, executor: Executor) -> Decided:
+        """Return what an executor has decided so far."""
+        others = {name: getattr(executor, name) for name in DECISIONS}
+        return cls(executor.following, executor.stop, len(executor.events), others)
+
+
+def undo(executor: Executor, time: float, before: Decided) -> None:
+    """Follow from a time on what a driver has, and undo what was decided since: that was not in time.
+
+    Args:
+        executor: The executor.
+        time: Time of the clock [s].
+        before: What had been decided; its stop, if there is one, begins at that time.
+    """
+    undone = executor.events[before.events :]
+    del executor.events[before.events :]
+    for event in undone:
+        if event.kind in TAKEN:
+            said = {name: event.data[name] for name in ("number", "part", "took")}
+            executor.log(event.time, TAKEN[event.kind], why="the step that took it came too late", **said)
+        elif event.kind not in UNSAID:
+            executor.events.append(event)
+    executor.log(time, "late")
+    for name, value in before.others.items():
+        setattr(executor, name, value)
+    executor.stop, executor.following = before.stop, before.following
+    if executor.stop is not None and not executor.following.at_rest(time):
+        executor.following = executor.stop
+    if executor.following is not executor.followed[-1][1]:
+        executor.follow(executor.following, time)
+    if executor.pending is not None and executor.pending.following is not executor.following:
+        executor.pending = None

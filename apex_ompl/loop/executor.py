@@ -22,11 +22,9 @@ from apex_ompl.loop.replan.evasion import GAIN, SOON, URGENT, endangered
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.result import BRAKING, GOING, STANDING, Event
 from apex_ompl.loop.tracking import Tracker
+from apex_ompl.moving.context import SAME_TIME, Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.fitting import misfit
-from apex_ompl.moving.following import SAME_TIME, Following
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Request
+from apex_ompl.moving.replanner import Request, joining_fault
 from apex_ompl.moving.search import EARLIER
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
@@ -42,7 +40,7 @@ class Executor:
     """One run's executor.
 
     Attributes:
-        ready: The robot among what stands still.
+        context: The robot among what stands still.
         replanning: Who plans motions anew.
         tracker: What is known of the obstacles.
         seed: Of random choices.
@@ -57,13 +55,13 @@ class Executor:
         conflict: Time of the first conflict of what is followed [s], or infinity.
         contact: The same without margins for what is uncertain, where the robot will be at rest soon; else infinity.
         unguarded: Number of steps at which the robot moved without a fail-safe stop.
-        endangered: Since when a conflict is known that the command does not answer yet [s], or None.
+        conflict_since: Since when a conflict is known that the command does not answer yet [s], or None.
         nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
         closed: Whether the time is up: no motion is asked for or taken any more.
         ending: Whether the robot follows the stop that ends the run.
         leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
         aside: The last step aside that was followed, or None.
-        sets_out: When it does [s].
+        departure: When it does [s].
         lead: How long before a step it is decided, by what was seen until then [s].
         ahead: How long before the conflict that was [s].
         doing: What the robot did then: it was ``going``, ``braking`` already, or ``standing``.
@@ -71,7 +69,7 @@ class Executor:
         hastened: When a faster motion was asked for last [s].
     """
 
-    ready: Ready
+    context: RunContext
     replanning: Replanning
     tracker: Tracker
     seed: int
@@ -87,11 +85,11 @@ class Executor:
     conflict: float = math.inf
     contact: float = math.inf
     unguarded: int = 0
-    endangered: float | None = None
+    conflict_since: float | None = None
     nearest: float = 0.0
     leaving: bool = False
     aside: Following | None = None
-    sets_out: float = -math.inf
+    departure: float = -math.inf
     lead: float = 0.0
     ahead: float = math.inf
     doing: str = ""
@@ -115,7 +113,7 @@ class Executor:
             predicted: The obstacles as they are expected to move.
             obstacles: Returns their records where they are now, with velocities; called where a replan is asked for.
         """
-        settings = self.ready.settings
+        settings = self.context.settings
         reachable = self.tracker.reachable(*settings.assumed, q=self.state(now)) if settings.guarded else None
         if not self.closed:
             self._answer(now, predicted, reachable)
@@ -134,7 +132,7 @@ class Executor:
 
     def _moves(self, now: float) -> bool:
         """Whether the robot moves in the step from now on."""
-        return self.following.start(now).moves or self.following.start(now + self.ready.settings.period).moves
+        return self.following.at(now).moves or self.following.at(now + self.context.settings.period).moves
 
     def close(self, now: float) -> None:
         """Come to rest, since the time is up: follow the stop in hand. To be called before each step from then on.
@@ -152,22 +150,22 @@ class Executor:
 
     def _look(self, now: float, predicted: DynamicObstacles) -> None:
         """Find the first conflict of what is followed."""
-        if self.ready.settings.by_distance:
+        if self.context.settings.by_distance:
             found = now if self._distance(now, predicted) < self.nearest else math.inf
         else:
             found = self._first_conflict(self.following, now, predicted)
         if math.isfinite(found) and not math.isfinite(self.conflict):
             self.log(now, "conflict", at=found)
-            self.endangered, self.ahead, self.doing = now, found - now, self._doing(now)
+            self.conflict_since, self.ahead, self.doing = now, found - now, self._doing(now)
         if not math.isfinite(found):
-            self.endangered = None
+            self.conflict_since = None
         self.conflict, self.contact = found, math.inf
-        if math.isfinite(found) and self.following.at_rest(now + self.ready.settings.budget):
-            self.contact = self._first_conflict(self.following, now, predicted.nominal(self.ready.settings.margin))
+        if math.isfinite(found) and self.following.at_rest(now + self.context.settings.budget):
+            self.contact = self._first_conflict(self.following, now, predicted.nominal(self.context.settings.margin))
 
     def _doing(self, now: float) -> str:
         """Return whether the robot is going, braking, or standing."""
-        if not self.following.start(now).moves:
+        if not self.following.at(now).moves:
             return STANDING
         return BRAKING if self.following is self.braking else GOING
 
@@ -175,7 +173,7 @@ class Executor:
         """Return how far obstacles are from the robot, at most twice the trigger [m]."""
         looked = np.array([now])
         clear, _ = clearance_in_time(
-            self.ready.kernel, predicted, self.state(now)[None], looked, 2.0 * self.ready.settings.trigger
+            self.context.kernel, predicted, self.state(now)[None], looked, 2.0 * self.context.settings.trigger
         )
         return float(clear.min())
 
@@ -184,23 +182,23 @@ class Executor:
 
         A robot that leaves without a fail-safe stop does not wait for an answer.
         """
-        waited = self.endangered is not None and now > self.endangered + SAME_TIME
+        waited = self.conflict_since is not None and now > self.conflict_since + SAME_TIME
         if not (waited or self.leaving) or self.conflict >= now + NEAR or self.following.at_rest(now):
             return
-        if not self.following.start(now).moves or self.following in (self.stop, self.braking):
+        if not self.following.at(now).moves or self.following in (self.stop, self.braking):
             return
-        stop = self.ready.unproved_stop(self.following, now) if self.stop is None else self.stop
+        stop = self.context.unproved_stop(self.following, now) if self.stop is None else self.stop
         if self._first_conflict(stop, now, predicted) > self.conflict + GAIN:
             self._follow_stop(now, stop)
 
     def _first_conflict(self, one: Following, now: float, predicted: DynamicObstacles) -> float:
         """Return the time of the first conflict of a motion, or of standing where it ends [s], or infinity."""
-        hold = self.ready.settings.hold if one.to_goal else self.ready.settings.rest_hold
-        return self.ready.first_conflict(predicted, one, now, max(one.end, now) + hold)
+        hold = self.context.settings.hold if one.to_goal else self.context.settings.rest_hold
+        return self.context.first_conflict(predicted, one, now, max(one.end, now) + hold)
 
     def blind(self, now: float) -> bool:
         """Whether there was no look of use for too long."""
-        return now - self.tracker.last > self.ready.settings.silence
+        return now - self.tracker.last > self.context.settings.silence
 
     def _stop_blind(self, now: float) -> None:
         """Stop, since there was no look of use for too long."""
@@ -221,7 +219,7 @@ class Executor:
 
     def _stop_at(self, now: float) -> Following | None:
         """Return the stop in hand, or one that is not proved where none is wanted; None where there is none."""
-        return self.stop if self.ready.settings.guarded else self.ready.unproved_stop(self.following, now)
+        return self.stop if self.context.settings.guarded else self.context.unproved_stop(self.following, now)
 
     def _follow_stop(self, now: float, stop: Following) -> None:
         self.log(now, "stop", at=stop.end)
@@ -232,7 +230,7 @@ class Executor:
     @property
     def _patience(self) -> float:
         """Time behind which a motion was to begin for which its answer is waited for [s]."""
-        settings = self.ready.settings
+        settings = self.context.settings
         return settings.stuck if settings.from_rest else settings.period
 
     def _guard(self, now: float, reachable: DynamicObstacles, predicted: DynamicObstacles) -> None:
@@ -244,19 +242,19 @@ class Executor:
         elif self.following is self.aside and self._proved_to_rest(now, reachable):
             self.stop = self.following
             return
-        then = now + self.ready.settings.period
-        found = self.ready.proved_stop(reachable, self.following, now, then)
+        then = now + self.context.settings.period
+        found = self.context.proved_stop(reachable, self.following, now, then)
         if found is not None:
             if self.leaving:  # a stop in place is not what it leaves for, nor one where it would be touched as well
-                waits = now <= self.sets_out or not self.following.start(now).velocity.any()
+                waits = now <= self.departure or not self.following.at(now).velocity.any()
                 self.leaving = waits or self._first_conflict(found, now, predicted) < now + NEAR
             self.stop = found
             return
         if self.leaving or self.following.at_rest(now):
             self.stop = None
-        elif not self.following.start(now).moves:  # it did not set out yet
+        elif not self.following.at(now).moves:  # it did not set out yet
             self.stop = None
-            self.follow(Following.standing(self.state(now), now, self.ready.names), now)
+            self.follow(Following.standing(self.state(now), now, self.context.names), now)
             self.log(now, "stop", at=now)
         elif self.stop is None:
             self.log(now, "broken assumption", what="no stop is in hand")
@@ -265,15 +263,15 @@ class Executor:
 
     def _proved_to_rest(self, now: float, reachable: DynamicObstacles) -> bool:
         """Whether all that the robot follows is proved until it is at rest, from when it moves on."""
-        begin = now if self.following.start(now).moves else max(now, self.sets_out)
-        return math.isinf(self.ready.first_conflict(reachable, self.following, begin, self.following.end))
+        start = now if self.following.at(now).moves else max(now, self.departure)
+        return math.isinf(self.context.first_conflict(reachable, self.following, start, self.following.end))
 
     def _answered(self, now: float, how: str) -> None:
         """Note how long after a conflict was known the command changed."""
-        if self.endangered is not None:
-            took = now - self.endangered + self.lead
+        if self.conflict_since is not None:
+            took = now - self.conflict_since + self.lead
             self.log(now, "reaction", seconds=took, how=how, ahead=self.ahead, doing=self.doing)
-            self.endangered = None
+            self.conflict_since = None
 
     def _answer(self, now: float, predicted: DynamicObstacles, reachable: DynamicObstacles | None) -> None:
         """Take the answer of a replan that is known by now, where it is of use."""
@@ -293,18 +291,18 @@ class Executor:
                 self.pending = None
             return
         self.pending, found, part = None, reply.answer.found, reply.answer.part
-        took = {"number": request.number, "part": part, "took": reply.answer.charges.spent}
+        took = {"number": request.number, "part": part, "took": reply.answer.budget.spent}
         if found is None:
             self.log(now, request.refused, why=reply.failed, **took)
             return
         request, found = self._at_once(now, request, found, predicted)
         why, aside, leaving = self._fault(now, request, found, predicted), False, False
         if not why and reachable is not None:
-            aside, then = self._may_leave(now, found), found.begin + self.ready.settings.period
-            proved = aside and self.ready.proved_to_rest(reachable, found)
-            risk = self.ready.settings.evade == "risk" and self.following.at_rest(found.begin)
+            aside, then = self._may_leave(now, found), found.start_time + self.context.settings.period
+            proved = aside and self.context.proved_to_rest(reachable, found)
+            risk = self.context.settings.evade == "risk" and self.following.at_rest(found.start_time)
             leaving = risk and aside and not proved  # a stop at once is no way to leave
-            if not (proved or leaving) and self.ready.proved_stop(reachable, found, found.begin, then) is None:
+            if not (proved or leaving) and self.context.proved_stop(reachable, found, found.start_time, then) is None:
                 why = "no stop behind its first step is proved"
         if why:
             self.log(now, request.refused, why=why, **took)
@@ -315,42 +313,42 @@ class Executor:
             self.route = found
         head = self.following.piece(now, request.join) if request.join > now + 1e-9 else None
         self.leaving = leaving or (self.leaving and not self.following.at_rest(now))
-        self.follow(found if head is None else found.behind(head, now), now)
-        self.sets_out, self.stop = found.begin, None if self.leaving else self.stop
+        self.follow(found if head is None else found.after(head, now), now)
+        self.departure, self.stop = found.start_time, None if self.leaving else self.stop
         self.aside = self.following if aside else None
-        if self.ready.settings.by_distance:
-            self.nearest = min(self.ready.settings.trigger, self._distance(now, predicted) - NEARER)
+        if self.context.settings.by_distance:
+            self.nearest = min(self.context.settings.trigger, self._distance(now, predicted) - NEARER)
 
     def _at_once(
         self, now: float, request: Request, found: Following, predicted: DynamicObstacles
     ) -> tuple[Request, Following]:
         """Return a request and its answer, which begins now where a robot that stands can set out at once."""
-        if request.following is not self.following or abs(found.begin - request.join) > SAME_TIME:
+        if request.following is not self.following or abs(found.start_time - request.join) > SAME_TIME:
             return request, found
-        earlier = replace(request, join=now), replace(found, begin=now)
+        earlier = replace(request, join=now), replace(found, start_time=now)
         if self.following.at_rest(now) and now < request.join and not self._fault(now, *earlier, predicted):
             return earlier
-        if self.ready.settings.from_rest and self.following.at_rest(request.join):  # or wait
+        if self.context.settings.from_rest and self.following.at_rest(request.join):  # or wait
             join = max(request.join, now)
-            return replace(request, join=join), replace(found, begin=join)
+            return replace(request, join=join), replace(found, start_time=join)
         return request, found
 
     def _fault(self, now: float, request: Request, found: Following, predicted: DynamicObstacles) -> str:
         """Return why an answer is of no use any more, or nothing."""
-        settings = self.ready.settings
+        settings = self.context.settings
         if request.following is not self.following:
             return "the robot follows another motion by now"
         if self.leaving and found.to_goal and not self.following.at_rest(now):
             return "the robot leaves without a fail-safe stop"
         if now > request.join + 1e-9:
             return "it came too late"
-        unfit = misfit(self.ready, found, request)
+        unfit = joining_fault(self.context, found, request)
         if unfit or not settings.verified:
             return unfit
         if not math.isfinite(self.conflict) and self.following.to_goal and found.to_goal:
             if found.end > self.following.end - EARLIER + SAME_TIME:
                 return "it is hardly faster"
-        conflict = self._first_conflict(found, found.begin, predicted)
+        conflict = self._first_conflict(found, found.start_time, predicted)
         gains = self._may_leave(now, found) and conflict > self.conflict + GAIN
         if math.isfinite(conflict) and not gains:
             return "what was seen since then is in the way"
@@ -358,9 +356,9 @@ class Executor:
 
     def _may_leave(self, now: float, found: Following) -> bool:
         """Whether the robot may step aside along a motion, since what comes would touch it where it is, or goes."""
-        if found.to_goal or self.ready.settings.evade == "never":
+        if found.to_goal or self.context.settings.evade == "never":
             return False
-        return (self.contact if self.following.at_rest(found.begin) else self.conflict) < now + SOON
+        return (self.contact if self.following.at_rest(found.start_time) else self.conflict) < now + SOON
 
     def _ask(
         self,
@@ -370,16 +368,16 @@ class Executor:
         obstacles: Callable[[], tuple[Obstacle, ...]],
     ) -> None:
         """Ask for a replan where one is of use."""
-        settings = self.ready.settings
+        settings = self.context.settings
         self._give_up(now)
         if self.pending is not None or not self._wants(now):
             return
         join = now + settings.budget
         self.asked += 1
         error, fastest = settings.assumed
-        berth = max(settings.berth, error + BLIND_TIME * fastest)
+        clearance_margin = max(settings.clearance_margin, error + BLIND_TIME * fastest)
         request = Request(
-            self.asked, now, join, self.following, self.route, predicted, berth, obstacles(), self.conflict, self.seed,
+            self.asked, now, join, self.following, self.route, predicted, clearance_margin, obstacles(), self.conflict, self.seed,
             contact=self.contact, reachable=reachable,
             leaving=(self.leaving or self.following is self.aside) and not self.following.at_rest(join),
         )  # fmt: skip
@@ -393,7 +391,7 @@ class Executor:
         It is one for a faster motion, or one of a robot that is about to be touched where it stands, so that it steps
         aside at once.
         """
-        settings, request = self.ready.settings, self.pending
+        settings, request = self.context.settings, self.pending
         if request is None or settings.from_rest or math.isfinite(request.conflict):
             return
         if not (settings.guarded or settings.hastens):  # a reflex, or one plan that is followed blindly
@@ -409,7 +407,7 @@ class Executor:
 
     def _wants(self, now: float) -> bool:
         """Whether the robot needs another motion."""
-        settings = self.ready.settings
+        settings = self.context.settings
         if self.tracker.awaited or self.blind(now):
             return False
         if not settings.monitored:

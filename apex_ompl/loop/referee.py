@@ -19,8 +19,7 @@ from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment_errors import within
 from apex_ompl.loop.result import Outcome
-from apex_ompl.moving.dynamic_obstacles import clearance_in_time, prove_motion
-from apex_ompl.moving.scripted import Piece, ScriptedDynamicObstacles
+from apex_ompl.moving.dynamic_obstacles import Piece, ScriptedDynamicObstacles, clearance_in_time, prove_motion
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
@@ -208,17 +207,17 @@ class ExactDynamicObstacles:
         """Yield the times at which the sphere covers do not prove the robot apart, with names of what is there."""
         kernel = self._scripted.kernel
         for piece in self._scripted.pieces(float(times[-1])):
-            if piece.begin == piece.end:  # a moment, of which there is nothing to prove
+            if piece.start == piece.end:  # a moment, of which there is nothing to prove
                 yield from self._among(motion, times, piece)
                 return
-            time, last = piece.begin, -np.inf
+            time, last = piece.start, -np.inf
             while len(piece.dynamic):
                 conflict = prove_motion(kernel, piece.dynamic, motion, time, piece.end)
                 if not conflict:
                     break
                 time = min(conflict.time + STRETCH, piece.end)
-                begin = max(conflict.time - SPACING, piece.begin)
-                yield from self._among(motion, times[(times >= begin) & (times > last) & (times <= time)], piece)
+                start = max(conflict.time - SPACING, piece.start)
+                yield from self._among(motion, times[(times >= start) & (times > last) & (times <= time)], piece)
                 last = time
                 if time >= piece.end:
                     break

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.loop.observation import Observation
-from apex_ompl.problems.worlds import World
+from apex_ompl.loop.environment import Environment, Observation
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing, vector
 from apex_ompl.util.display import fields_line, one_line
@@ -62,13 +61,13 @@ class Sensor:
         """Largest distance between where an obstacle is and where it is seen [m]."""
         return CUT * self.noise
 
-    def observe(self, world: World, number: int) -> Observation:
+    def observe(self, environment: Environment, number: int) -> Observation:
         """Return what the look of a number shows, negative before time 0; the world must have come to that time.
 
         It does not depend on other looks, nor do the errors of one obstacle on which others there are.
         """
         stamp = number / self.rate
-        seen = [self._seen(obstacle, number) for obstacle in world.present(stamp)]
+        seen = [self._seen(obstacle, number) for obstacle in environment.present(stamp)]
         return Observation(stamp, stamp + self.age, tuple(obstacle for obstacle in seen if obstacle is not None))
 
     def _seen(self, obstacle: Obstacle, number: int) -> Obstacle | None:
@@ -85,19 +84,19 @@ class Sensor:
 class SensorStream:
     """The looks of a sensor at one world, in order, each given once."""
 
-    def __init__(self, sensor: Sensor, world: World, watched: float = 0.0) -> None:
+    def __init__(self, sensor: Sensor, environment: Environment, watched: float = 0.0) -> None:
         """Begin with the look at time 0, or some time before [s].
 
         Raises:
             ParameterError: That time is not from 0 to an hour, or to that of a million looks.
         """
         check_number(watched, "watched", 0.0, min(LONGEST, EARLIEST / sensor.rate))
-        self.sensor, self._world = sensor, world
+        self.sensor, self._environment = sensor, environment
         self._number, self._until = -int(watched * sensor.rate + 1e-9), -watched
 
     def __repr__(self) -> str:
         """Return the sensor and the world."""
-        return one_line("SensorStream", repr(self.sensor), repr(self._world))
+        return one_line("SensorStream", repr(self.sensor), repr(self._environment))
 
     def observations(self, until: float) -> tuple[Observation, ...]:
         """Return the observations with a stamp up to a time [s] that were not given yet, in order of stamp.
@@ -113,6 +112,6 @@ class SensorStream:
         self._until = until
         found = []
         while self._number / self.sensor.rate <= until:
-            found.append(self.sensor.observe(self._world, self._number))
+            found.append(self.sensor.observe(self._environment, self._number))
             self._number += 1
         return tuple(found)

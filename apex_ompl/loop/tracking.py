@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.loop.observation import Observation
+from apex_ompl.loop.environment import Observation
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
 from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array

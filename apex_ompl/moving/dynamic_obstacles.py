@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays, clearance
 from apex_ompl.kernel.compiled.layout import pack, unpack
 from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import is_there, obstacle_at, place_at, script_times, velocity_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
@@ -194,7 +195,7 @@ class Conflict(NamedTuple):
     """Where a motion can no longer be proved.
 
     Attributes:
-        time: First moment that cannot be proved [s from the motion's begin]; infinite where all of it is proved.
+        time: First moment that cannot be proved [s from the motion's start]; infinite where all of it is proved.
         body: Name of the body that is not proved apart there, empty where there is none.
         dynamic obstacle: Name of the dynamic obstacle.
         intervals: Number of intervals of time looked at.
@@ -217,7 +218,7 @@ def curve_of(motion: Trajectory) -> Curve:
 
 
 def prove_motion(
-    kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, begin: float = 0.0, end: float | None = None,
+    kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, start: float = 0.0, end: float | None = None,
     *, clock: float = 0.0, shortest: float = SHORTEST,
 ) -> Conflict:  # fmt: skip
     """Prove that a timed motion stays apart from obstacles that move, and find the first moment that is not proved.
@@ -230,7 +231,7 @@ def prove_motion(
         kernel: The kernel of the robot with what it holds.
         dynamic: The obstacles.
         motion: The motion; behind its end the robot stands.
-        begin: Where on the motion to begin [s].
+        start: Where on the motion to start [s].
         end: Where to end [s], by default at its end.
         clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
         shortest: Length of an interval of time that is given up [s].
@@ -241,13 +242,13 @@ def prove_motion(
     if motion.dof != kernel.robot.dof:
         raise ParameterError("motion", motion.dof, f"one of {kernel.robot.dof} joints")
     until = motion.duration if end is None else end
-    for name, value in (("begin", begin), ("end", until), ("clock", clock)):
+    for name, value in (("start", start), ("end", until), ("clock", clock)):
         check_number(value, name)
     curve = curve_of(motion)
     found = np.empty(3, np.int64)
     time = first_conflict(
         *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates, curve.slack,
-        float(begin), float(until), float(clock), float(shortest),
+        float(start), float(until), float(clock), float(shortest),
         np.empty((len(dynamic.arrays.kind), 3)), np.empty(kernel.robot.dof), found,
     )  # fmt: skip
     body, dynamic_obstacle, intervals = found.tolist()
@@ -296,3 +297,73 @@ def allowed_rows(kernel: Kernel, allowed: Iterable[tuple[str, str]], names: Sequ
             if dynamic_obstacle in names:
                 rows += [(k, dynamic_obstacle) for k, name in enumerate(kernel.robot.body_names) if name == body]
     return rows
+
+
+class Piece(NamedTuple):
+    """A piece of time in which all obstacles move at constant velocity.
+
+    Attributes:
+        start: Its start [s].
+        end: Its end [s].
+        dynamic: The obstacles that are there, with ``start`` as their stamp; good until the next piece is asked for.
+    """
+
+    start: float
+    end: float
+    dynamic: DynamicObstacles
+
+
+class ScriptedDynamicObstacles:
+    """Obstacles that move by scripts, beside a kernel's scene.
+
+    Attributes:
+        kernel: The kernel of the robot with what it holds.
+        obstacles: The obstacles with their scripts.
+    """
+
+    def __init__(self, kernel: Kernel, obstacles: Iterable[Obstacle], allowed: Sequence[tuple[str, str]] = ()) -> None:
+        """Take obstacles, and pairs of names of bodies that may touch.
+
+        Raises:
+            SceneError, ParameterError: As :class:`apex_ompl.moving.dynamic_obstacles.DynamicObstacles`.
+        """
+        self.kernel, self.obstacles, self._allowed = kernel, tuple(obstacles), tuple(allowed)
+        self._known: dict[tuple[str, ...], DynamicObstacles] = {}
+        self._dynamic(self.obstacles, 0.0)
+
+    def pieces(self, end: float) -> Iterator[Piece]:
+        """Yield the pieces of the time from 0 to ``end`` [s] in turn; a single one without length where that is 0."""
+        inner = {time for o in self.obstacles for time in script_times(o) if 0.0 < time < end}
+        edges = [0.0, *sorted(inner), end]
+        for start, until in zip(edges[:-1], edges[1:], strict=True):
+            here = [o for o in self.obstacles if is_there(o, start)]
+            yield Piece(start, until, self._dynamic(here, start))
+
+    def clearances(self, motion: Trajectory, times: Array) -> Array:
+        """Return lower bounds of a motion's distance to the obstacles at some times, shape (N,) [m].
+
+        They are distances of the sphere cover, which contains the robot; infinite where there is no obstacle, NaN where
+        a hand is outside its limits.
+
+        Args:
+            motion: The motion; behind its end the robot stands.
+            times: Shape (N,), increasing from 0 or more [s].
+        """
+        found = np.full(len(times), np.inf)
+        for start, end, dynamic in self.pieces(float(times[-1]) if len(times) else 0.0):
+            rows = np.flatnonzero((times >= start) & (times <= end))
+            if len(dynamic) and len(rows):
+                at = times[rows]
+                found[rows] = clearance_in_time(self.kernel, dynamic, motion(at), at)[0]
+        return found
+
+    def _dynamic(self, here: Sequence[Obstacle], time: float) -> DynamicObstacles:
+        """Return obstacles as they are from a time on [s]."""
+        names = tuple(o.name for o in here)
+        if names not in self._known:
+            rows = allowed_rows(self.kernel, self._allowed, names)
+            self._known[names] = DynamicObstacles([obstacle_at(o, time) for o in here], rows)
+        dynamic = self._known[names]
+        for o in here:
+            dynamic.update(o.name, place_at(o, time), velocity_at(o, time), stamp=time)
+        return dynamic

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.compiled.blocked_intervals import MOST_SPANS, blocked_intervals
 from apex_ompl.kernel.compiled.speed_profile import first_blocked, follow_profile, profile_places, push_bounds
 from apex_ompl.kernel.compiled.speed_search import MOST_TIMES, earliest_arrivals
-from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
-from apex_ompl.moving.safe_intervals import blocked
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
@@ -116,7 +116,7 @@ def retime(
     """Return the motion along the rest of a path that arrives first, among obstacles that move.
 
     It begins with the state of the given motion at ``time`` exactly, ends at rest where that ends, and keeps the
-    limits. Its places are kept out of the blocked intervals (:func:`apex_ompl.moving.safe_intervals.blocked`), so that
+    limits. Its places are kept out of the blocked intervals (:func:`apex_ompl.moving.retime.blocked`), so that
     :func:`apex_ompl.moving.dynamic_obstacles.prove_motion` seldom finds a conflict; only that is the proof.
 
     Args:
@@ -124,7 +124,7 @@ def retime(
         dynamic: The obstacles.
         motion: A motion within the limits that ends at rest.
         limits: Limits of the joints.
-        time: Where on the motion to begin [s].
+        time: Where on the motion to start [s].
         clock: Time of the dynamic obstacles' stamps at which the result begins [s].
         hold: Time for which the end must stay free from the arrival on [s].
         horizon: Largest duration of the result [s].
@@ -160,7 +160,7 @@ class _Search:
         where = np.stack([edges[:-1], edges[1:]], axis=1), np.stack([self.points, self.points], axis=1)
         self.pieces, self.stops = (
             blocked(
-                kernel, dynamic, motion, p, begin=self.clock, end=self.latest + self.hold, slack=self.deviation
+                kernel, dynamic, motion, p, start=self.clock, end=self.latest + self.hold, slack=self.deviation
             ) for p in where
         )  # fmt: skip
         self.states = np.stack([motion.positions, motion.velocities, motion.accelerations])
@@ -224,19 +224,19 @@ class _Search:
             if self._free(self._places(profile, self.clock, CHECKED, 0.0), self.clock, CHECKED):
                 yield Retimed(motion, "", 0.0)
             return
-        for begin in self._begins(head * self.length - window / 2.0 - LEAD * SPACINGS[0]):
-            started = self.clock + wait + begin - self.time
+        for start in self._starts(head * self.length - window / 2.0 - LEAD * SPACINGS[0]):
+            started = self.clock + wait + start - self.time
             before = self._places(profile, self.clock, CHECKED, 0.0)[: math.ceil((started - self.clock) / CHECKED) + 1]
             if not self._free(before, self.clock, CHECKED):
                 return
             for h in SPACINGS:
                 places = self._places(profile, started, h, window)
-                followed = self._followed(begin, places, h)
+                followed = self._followed(start, places, h)
                 if followed is not None and self._free(places, started, h):
                     times, states, off = followed
-                    yield Retimed(self._with_head(wait, begin, times, states), "", off)
+                    yield Retimed(self._with_head(wait, start, times, states), "", off)
 
-    def _begins(self, longest: float) -> list[float]:
+    def _starts(self, longest: float) -> list[float]:
         """Return places from which to leave the given motion, the latest first, where it keeps from its limits."""
         places = np.linspace(0.0, max(longest, 0.0), HEADS) + self.time
         looked = places[:, None] + SPACINGS[0] * np.arange(LEAD)
@@ -244,18 +244,18 @@ class _Search:
         easy = use.max(axis=1).reshape(looked.shape).max(axis=1) <= EASY
         return list(dict.fromkeys([*places[easy][::-1].tolist()[:2], float(places[-1]), self.time]))
 
-    def _places(self, profile: Profile, begin: float, h: float, window: float) -> Array:
-        """Return the places of a profile at times h apart from ``begin`` on, averaged over a window in time."""
+    def _places(self, profile: Profile, start: float, h: float, window: float) -> Array:
+        """Return the places of a profile at times h apart from ``start`` on, averaged over a window in time."""
         x, levels, departures = profile
         half = round(window / h) // 2
-        count = max(math.ceil((departures[-1, 0] - begin) / h - SAME_TIME) + half, 2)
+        count = max(math.ceil((departures[-1, 0] - start) / h - SAME_TIME) + half, 2)
         places = np.empty(count + 1)
-        profile_places(x, self.length, self.time, levels, departures, begin, h, places)
+        profile_places(x, self.length, self.time, levels, departures, start, h, places)
         places[-1] = self.points[-1]
         if not half:
             return places
         lead = places[0] + (places[1] - places[0]) * np.arange(-half, 0)
-        since = np.maximum(begin + h * np.arange(count + half + 1) - departures[-1, 0], 0.0)
+        since = np.maximum(start + h * np.arange(count + half + 1) - departures[-1, 0], 0.0)
         padded = np.append(places, np.full(half, places[-1])) + math.sqrt(x[levels[-1]]) * since
         padded = np.append(lead, padded) - places[0]
         means: Array = places[0] + np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).mean(axis=1)
@@ -265,13 +265,13 @@ class _Search:
         means = np.where(np.abs(means - nearest) < SAME_PLACE, nearest, means)  # where it waits
         return np.maximum.accumulate(means)
 
-    def _followed(self, begin: float, places: Array, h: float) -> tuple[Array, Array, float] | None:
+    def _followed(self, start: float, places: Array, h: float) -> tuple[Array, Array, float] | None:
         """Return times, states and deviation of the motion with places h apart in time, where it keeps the limits."""
         dof, limits, size = self.motion.dof, self.limits, len(places) + 1
         control, off, times, out = np.empty((size + 2, dof)), np.empty(dof), np.empty(size), np.empty((3, size, dof))
         bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
         count = follow_profile(
-            compact(self.motion.times), self.states, float(begin), places, h, *bounds, np.empty((3, dof)), control, off,
+            compact(self.motion.times), self.states, float(start), places, h, *bounds, np.empty((3, dof)), control, off,
             times, out,
         )  # fmt: skip
         if not count:
@@ -295,12 +295,67 @@ class _Search:
         kept[1:-1] = ~(rests[:-2] & rests[1:-1] & rests[2:])
         return Trajectory.unchecked(moments[kept], np.ascontiguousarray(rows[:, kept]), self.motion.joint_names)
 
-    def _free(self, places: Array, begin: float, h: float) -> bool:
+    def _free(self, places: Array, start: float, h: float) -> bool:
         """Whether places at times h apart meet no blocked interval; the end also for as long as it must be free."""
         step = first_blocked(
-            *self.pieces, self.points, self.stops.spans, self.stops.counts, places, float(begin), h
+            *self.pieces, self.points, self.stops.spans, self.stops.counts, places, float(start), h
         )  # fmt: skip
-        end = begin + len(places) * h
+        end = start + len(places) * h
         return step < 0 and (
             places[-1] < self.points[-1] or not self.stops.meets(self.stages, end - h, end + self.hold)
         )
+
+
+class Blocked(NamedTuple):
+    """Intervals of time in which places along a motion are blocked.
+
+    Attributes:
+        places: Begins and ends of the places, in the motion's own time, shape (P, 2) [s].
+        spans: Their intervals in order, shape (P, MOST_SPANS, 2) [s of the dynamic obstacles' stamps].
+        counts: Numbers of them, shape (P,).
+    """
+
+    places: Array
+    spans: Array
+    counts: NDArray[np.int64]
+
+    def longer(self, by: float) -> Array:
+        """Return the intervals, longer at both ends [s]."""
+        longer: Array = self.spans + np.array([-by, by])
+        return longer
+
+    def meets(self, place: int, first: float, last: float) -> bool:
+        """Whether a place is blocked at any time between two [s]."""
+        spans = self.spans[place, : self.counts[place]]
+        return bool(np.any((spans[:, 0] <= last) & (spans[:, 1] >= first)))
+
+
+def blocked(
+    kernel: Kernel,
+    dynamic: DynamicObstacles,
+    motion: Trajectory,
+    places: Array,
+    *,
+    start: float,
+    end: float,
+    slack: float = 0.0,
+) -> Blocked:
+    """Find when dynamic obstacles block places along a motion, by the robot's spheres: never too short.
+
+    Args:
+        kernel: The kernel of the robot with what it holds.
+        dynamic: The obstacles.
+        motion: The motion.
+        places: Begins and ends of pieces of the motion, in its own time and in order, shape (P, 2) [s]; the same twice
+            for a single state.
+        start: First time that is looked at [s of the dynamic obstacles' stamps].
+        end: The last one [s].
+        slack: Distance from the path, of each joint, that counts as being on it [rad].
+    """
+    curve, dof = curve_of(motion), motion.dof
+    spans, counts = np.zeros((len(places), MOST_SPANS, 2)), np.empty(len(places), np.int64)
+    blocked_intervals(
+        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates,
+        curve.slack + slack, places, float(start), float(end), np.empty(dof), spans, counts,
+    )  # fmt: skip
+    return Blocked(places, spans, counts)

@@ -8,14 +8,17 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from apex_ompl.moving.charges import Charges
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.motion_pool import MotionPool
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Request
-from apex_ompl.moving.timed_spline import MotionOptimizer, MotionSettings, Start
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import Following, RunContext
+from apex_ompl.moving.dynamic_obstacles import clearance_in_time
+from apex_ompl.moving.replanner import Request
+from apex_ompl.moving.timed_spline import MotionOptimizer, MotionPool, MotionSettings, Start
 from apex_ompl.robot.model import Limits
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import standing, vector
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.moving_start import between
 from apex_ompl.types import Array
@@ -38,9 +41,9 @@ class Search:
     """One replan under way: what its parts share.
 
     Attributes:
-        ready: The robot among what stands still.
+        context: The robot among what stands still.
         request: What is asked for.
-        charges: What was spent.
+        budget: What was spent.
         start: What the robot does when the motion begins.
         rng: Source of random choices.
         best: The best motion so far, or None.
@@ -50,9 +53,9 @@ class Search:
         until: Time by the charges at which to end [s].
     """
 
-    ready: Ready
+    context: RunContext
     request: Request
-    charges: Charges
+    budget: ComputeBudget
     start: Start = field(init=False)
     rng: np.random.Generator = field(init=False)
     best: Following | None = None
@@ -63,12 +66,12 @@ class Search:
 
     def __post_init__(self) -> None:
         """Read the request."""
-        self.start, self.rng = self.request.following.start(self.request.join), self.request.rng
+        self.start, self.rng = self.request.following.at(self.request.join), self.request.rng
 
     @property
     def goals(self) -> Array:
         """Goals, shape (goals, dof), the nearest first."""
-        goals = self.ready.goals
+        goals = self.context.goals
         order: Array = goals[np.argsort(np.linalg.norm(goals - self.start.position, axis=1), kind="stable")]
         return order
 
@@ -83,10 +86,10 @@ class Search:
 
     def direct(self, goal: Array, least: float = 0.0) -> Trajectory | None:
         """Return the fastest motion to a goal, shape (dof,), in a time or more [s], whatever is in the way, or None."""
-        self.charges.charge("direct motion")
+        self.budget.spend("direct motion")
         rest = np.zeros_like(goal)
         q, v, a = self.start
-        made = between(np.stack([[q, goal], [v, rest], [a, rest]]), self.ready.limits, self.ready.names, least)
+        made = between(np.stack([[q, goal], [v, rest], [a, rest]]), self.context.limits, self.context.names, least)
         if made is not None:
             self.least = min(self.least, made.duration)
         return made
@@ -119,22 +122,22 @@ class Search:
 
     def following(self, motion: Trajectory) -> Following:
         """Return a motion as one that is followed from the time of joining on."""
-        return Following(motion, self.request.join, self.ready.is_goal(motion.positions[-1]))
+        return Following(motion, self.request.join, self.context.is_goal(motion.positions[-1]))
 
     def accepts(self, motion: Trajectory) -> bool:
         """Whether a motion is proved, with the time that its end must stay clear."""
-        one, settings = self.following(motion), self.ready.settings
+        one, settings = self.following(motion), self.context.settings
         until = one.end + (settings.hold if one.to_goal else settings.rest_hold)
-        conflict = self.ready.first_conflict(self.request.predicted, one, one.begin, until, self.charges)
-        return not np.isfinite(conflict) and self.ready.clear_of_still(motion, self.charges)
+        conflict = self.context.first_conflict(self.request.predicted, one, one.start_time, until, self.budget)
+        return not np.isfinite(conflict) and self.context.clear_of_static(motion, self.budget)
 
     def over(self) -> bool:
         """Whether time is up, or what was found is good enough: a faster motion is looked for while it is followed."""
-        if self.charges.over() or self.charges.spent >= self.until:
+        if self.budget.over() or self.budget.spent >= self.until:
             return True
-        if self.cost == np.inf or self.request.hastens or not self.ready.settings.hastens:
+        if self.cost == np.inf or self.request.hastens or not self.context.settings.hastens:
             return False
-        return self.cost <= GOOD * self.least or self.charges.spent > ENOUGH_TIME * self.charges.limit
+        return self.cost <= GOOD * self.least or self.budget.spent > ENOUGH_TIME * self.budget.limit
 
     def delay(self, motion: Trajectory) -> float:
         """Return the time that a motion counts as longer since the guard may stop it [s].
@@ -145,24 +148,24 @@ class Search:
         at = self.unguarded_from(motion)
         if math.isinf(at):
             return 0.0
-        stop = self.ready.unproved_stop(self.following(motion), max(at - GUARDED, self.request.join))
-        until = stop.end + self.ready.settings.rest_hold
-        conflict = self.ready.first_conflict(self.request.predicted, stop, stop.begin, until, self.charges)
+        stop = self.context.unproved_stop(self.following(motion), max(at - GUARDED, self.request.join))
+        until = stop.end + self.context.settings.rest_hold
+        conflict = self.context.first_conflict(self.request.predicted, stop, stop.start_time, until, self.budget)
         return NARROW if math.isinf(conflict) or self.request.conflict < self.request.join + SOON else math.inf
 
     def unguarded_from(self, motion: Trajectory) -> float:
         """Return the time of the clock from which on stops from a motion will hardly be proved, or infinity [s]."""
-        settings, one, predicted = self.ready.settings, self.following(motion), self.request.predicted
+        settings, one, predicted = self.context.settings, self.following(motion), self.request.predicted
         if not settings.guarded:
             return math.inf
-        moments = np.arange(one.begin, one.end, GUARDED)
-        for begin in range(0, len(moments), TOGETHER):
-            if self.charges.over():
-                return float(moments[begin])
-            some = moments[begin : begin + TOGETHER]
-            proved, by_joints = self.ready.foreseen_stops(predicted, one, some, AGE, SPREAD)
-            self.charges.charge("foreseen stop", min(proved + 1, len(some)))
-            self.charges.charge("stop joint by joint", by_joints)
+        moments = np.arange(one.start_time, one.end, GUARDED)
+        for first in range(0, len(moments), TOGETHER):
+            if self.budget.over():
+                return float(moments[first])
+            some = moments[first : first + TOGETHER]
+            proved, by_joints = self.context.foreseen_stops(predicted, one, some, AGE, SPREAD)
+            self.budget.spend("foreseen stop", min(proved + 1, len(some)))
+            self.budget.spend("stop joint by joint", by_joints)
             if proved < len(some):
                 return float(some[proved])
         return math.inf
@@ -171,7 +174,7 @@ class Search:
     def soonest(self) -> float:
         """Time of the clock at which a motion begins at the earliest: a robot at rest does not wait [s]."""
         request = self.request
-        soon = request.asked + self.charges.spent + self.ready.settings.period
+        soon = request.asked + self.budget.spent + self.context.settings.period
         return min(soon, request.join) if request.following.at_rest(request.asked) else request.join
 
     def may_begin(self, motion: Trajectory) -> bool:
@@ -179,9 +182,9 @@ class Search:
         reachable, one = self.request.reachable, Following(motion, self.soonest)
         if reachable is None:
             return True
-        self.charges.charge("foreseen stop")
-        then = one.begin + self.ready.settings.period
-        return self.ready.proved_stop(reachable, one, one.begin, then) is not None
+        self.budget.spend("foreseen stop")
+        then = one.start_time + self.context.settings.period
+        return self.context.proved_stop(reachable, one, one.start_time, then) is not None
 
     def take(self, motion: Trajectory, part: str) -> bool:
         """Keep a proved motion where it is shorter than the best, or about so with more room; return whether it is."""
@@ -194,18 +197,18 @@ class Search:
         self.best, self.part, self.cost = self.following(motion), part, cost
         return True
 
-    def pool(self, berth: bool = True) -> MotionPool:
+    def pool(self, clearance_margin: bool = True) -> MotionPool:
         """Return an empty pool of motions, which are optimized with a berth around obstacles or without.
 
         The berth of a request is larger among fast obstacles; a proof is tried of what keeps the rest of it, since the
         guard stops a robot that comes nearer. (Trying it of all that might be proved changes times by 0.0 % in 40
         validation worlds.)
         """
-        request, ready = self.request, self.ready
-        dynamic = request.predicted.larger(request.berth) if berth else request.predicted
-        optimizer = MotionOptimizer(ready.kernel, dynamic, ready.limits, MOTIONS)
-        beyond = ready.settings.berth if berth else 0.0
-        return MotionPool(optimizer, self.start, request.join, self.charges, self.accepts, berth=beyond)
+        request, context = self.request, self.context
+        dynamic = request.predicted.larger(request.clearance_margin) if clearance_margin else request.predicted
+        optimizer = MotionOptimizer(context.kernel, dynamic, context.limits, MOTIONS)
+        beyond = context.settings.clearance_margin if clearance_margin else 0.0
+        return MotionPool(optimizer, self.start, request.join, self.budget, self.accepts, clearance_margin=beyond)
 
 
 class Guess(NamedTuple):
@@ -231,7 +234,7 @@ class Source(Protocol):
     def name(self) -> str:
         """Its name."""
 
-    def prepare(self, ready: Ready) -> None:
+    def prepare(self, context: RunContext) -> None:
         """Load what it needs, before a run."""
 
     def guesses(self, search: Search) -> Iterator[Guess]:
@@ -243,3 +246,48 @@ def least_duration(states: Array, limits: Limits) -> float:
     way = np.abs(np.diff(states, axis=0)).sum(axis=0)
     distance = np.abs(states[-1] - states[0]) / limits.acceleration
     return float(max((way / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))
+
+
+LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
+
+
+def fresh_checker(context: RunContext) -> CollisionChecker:
+    """Return a checker of what stands still."""
+    setup = context.setup
+    return CollisionChecker(setup.robot, setup.problem.scene, setup.problem.attached, setup.problem.allowed)
+
+
+def place(checker: CollisionChecker, obstacle: Obstacle, position: ArrayLike) -> None:
+    """Let an obstacle stand at a position, shape (3,) [m], as one that does not move."""
+    if checker.is_obstacle(obstacle.name):
+        checker.move(obstacle.name, vector(position))
+    else:
+        checker.add(standing(obstacle).model_copy(update={"position": vector(position)}))
+
+
+def place_nearest(checker: CollisionChecker, search: Search, goal: Array) -> None:
+    """Let each obstacle stand where it is when one comes nearest to the straight motion to a goal, shape (dof,)."""
+    request = search.request
+    line = np.linspace(search.start.position, goal, LOOKS)
+    duration = least_duration(line, search.context.limits)
+    times = request.join + np.linspace(0.0, duration, LOOKS)
+    clear, _ = clearance_in_time(search.context.kernel, request.predicted, line, times)
+    nearest = float(times[int(np.argmin(clear))])
+    search.budget.spend("clearance in time", LOOKS)
+    for o in request.obstacles:
+        way = np.multiply(o.velocity or (0.0, 0.0, 0.0), nearest - request.asked)
+        place(checker, o, np.add(o.position, way))
+
+
+def rest_of_route(search: Search) -> Array | None:
+    """Return states of what is left of the last motion to a goal, shape (N, dof), or None."""
+    route = search.request.route
+    if route is None:
+        return None
+    states = route.motion(np.linspace(0.0, route.motion.duration, 256))
+    nearest = int(np.argmin(np.linalg.norm(states - search.start.position, axis=1)))
+    rest = states[nearest:]
+    if len(rest) < 2:
+        return None
+    wanted = np.linspace(0.0, len(rest) - 1.0, STATES)
+    return np.stack([np.interp(wanted, np.arange(len(rest)), column) for column in rest.T], axis=1)

@@ -16,7 +16,7 @@ EVADE = ("never", "proved", "risk")
 
 RANGES = {
     "watched": (0.0, 60.0), "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0),
-    "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "berth": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0),
+    "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "clearance_margin": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0),
     "trigger": (0.0, 1.0), "timeout": (0.1, 600.0), "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
     "memory": (0.1, 600.0), "silence": (0.01, 60.0),
 }  # fmt: skip
@@ -48,7 +48,7 @@ class LoopSettings:
         hold: Time for which the goal must stay clear from the arrival on [s].
         rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
         margin: Distance that is kept from obstacles that move [m].
-        berth: Distance beyond it at which motions are optimized to pass by, where there is room [m].
+        clearance_margin: Distance beyond it at which motions are optimized to pass by, where there is room [m].
         error: Largest error of an observed place, for the guarantee [m]; None is that of the sensor.
         fastest: Largest speed of any obstacle, for the guarantee [m/s]; None is that of the world.
         memory: Every obstacle is seen at least this often, for the guarantee [s]: one that was not, while the sensor
@@ -74,7 +74,7 @@ class LoopSettings:
     hold: float = 0.1
     rest_hold: float = 1.5
     margin: float = 0.005
-    berth: float = 0.05
+    clearance_margin: float = 0.05
     error: float | None = None
     fastest: float | None = None
     memory: float = 3.0

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop.result import RunResult
-from apex_ompl.moving.scripted import ScriptedDynamicObstacles
+from apex_ompl.moving.dynamic_obstacles import ScriptedDynamicObstacles
 from apex_ompl.robot import Robot
 from apex_ompl.timing.rests import rests
 from apex_ompl.types import Array

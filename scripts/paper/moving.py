@@ -24,7 +24,7 @@ from apex_ompl.loop.replan import methods
 from apex_ompl.loop.result import RunResult
 from apex_ompl.loop.run import load_world, run
 from apex_ompl.loop.sensor import Sensor
-from apex_ompl.moving.charges import cost_table
+from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.paths.path import path_length
 from apex_ompl.problems.alignment import SIZES

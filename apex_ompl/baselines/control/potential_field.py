@@ -9,10 +9,10 @@ import numpy as np
 
 from apex_ompl.baselines.control.short_horizon import Horizon, finish, first_proved
 from apex_ompl.kernel import Kernel
-from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
 from apex_ompl.moving.search import Search
 from apex_ompl.types import Array
 
@@ -117,19 +117,19 @@ class PotentialField:
     counts: tuple[int, ...] = (14, 8)
     near: float = 0.5
 
-    def prepare(self, ready: Ready) -> None:
+    def prepare(self, context: RunContext) -> None:
         """Nothing is needed."""
 
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+    def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
         """Return the motion down the potential, or a straight one to a goal that is near."""
-        search = Search(ready, request, charges)
+        search = Search(context, request, budget)
         if not len(search.goals):
-            return Answer(None, "", charges)
+            return Answer(None, "", budget)
         motion, part = finish(search, self.near), "finish"
         if motion is None:
-            horizon = Horizon(ready.limits, self.step)
+            horizon = Horizon(context.limits, self.step)
             motion, part = first_proved(search, horizon, self.controls(search, horizon), self.counts), "field"
-        return Answer(None if motion is None else search.following(motion), part, charges)
+        return Answer(None if motion is None else search.following(motion), part, budget)
 
     def field(self, goal: Array) -> Field:
         """Return the potential with a goal, shape (dof,)."""
@@ -137,15 +137,18 @@ class PotentialField:
 
     def controls(self, search: Search, horizon: Horizon) -> Array:
         """Return the accelerations down the potential, shape (K, dof) [rad/s^2]."""
-        ready, request = search.ready, search.request
-        field, fingers = self.field(search.goals[0]), ready.fingers
+        context, request = search.context, search.request
+        field, fingers = self.field(search.goals[0]), context.fingers
 
         def control(k: int, speed: Array, at: Array) -> Array:
             time = request.join + (k + 1) * self.step
-            _, force = field.potential_and_force(ready.kernel, request.predicted, at[0], time)
+            _, force = field.potential_and_force(context.kernel, request.predicted, at[0], time)
             force[fingers] = 0.0
-            search.charges.charge("force")
+            search.budget.spend("force")
             return force - self.damping * speed
 
         points = horizon.steer(search.start, (self.steps, 1), control)
         return horizon.applied(points)[:, 0]
+
+
+register("potential-field", PotentialField, "a reflex down an artificial potential", ONE_PLAN)

@@ -118,8 +118,8 @@ def first_proved(search: Search, horizon: Horizon, controls: Array, counts: tupl
     """
     for count in counts:
         points = horizon.roll(search.start, controls[:count, None])[:, 0]
-        motion = horizon.motion(search.start, points, search.ready.names)
-        search.charges.charge("short motion")
+        motion = horizon.motion(search.start, points, search.context.names)
+        search.budget.spend("short motion")
         if search.accepts(motion):
             return motion
     return None
@@ -137,8 +137,8 @@ def finish(search: Search, near: float) -> Trajectory | None:
 
 def straight(search: Search, goal: Array) -> Trajectory | None:
     """Return the straight motion to a state, or None where there is none within the limits from a moving start."""
-    start, limits, names = search.start, search.ready.limits, search.ready.names
-    search.charges.charge("straight motion")
+    start, limits, names = search.start, search.context.limits, search.context.names
+    search.budget.spend("straight motion")
     if not (start.velocity.any() or start.acceleration.any()):
         return time_path(np.stack([start.position, goal]), limits, names).trajectory
     return _stretched(search, np.linspace(start.position, goal, STRAIGHT), goal)
@@ -152,17 +152,17 @@ def along(search: Search, states: Array, goal: Array) -> Trajectory | None:
         states: States of the motion, evenly spaced in time, shape (N, dof).
         goal: Where it ends, shape (dof,).
     """
-    search.charges.charge("straight motion")
+    search.budget.spend("straight motion")
     return _stretched(search, states, goal)
 
 
 def _stretched(search: Search, states: Array, goal: Array) -> Trajectory | None:
     """Return the spline along states that takes as long as the limits ask for, or None where that is not found."""
-    limits = search.ready.limits
+    limits = search.context.limits
     spline = TimedSpline.along(states, least_duration(states, limits), search.start, goal)
     for _ in range(STRETCHES):
         least = least_knot_spacing(spline.control, limits)
         if least <= spline.spacing:
-            return spline.trajectory(search.ready.names)
+            return spline.trajectory(search.context.names)
         spline = spline.lasting(max(least, SLOWER * spline.spacing))
     return None

@@ -8,25 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.baselines.drrt.goal_tree import AreFree
+from apex_ompl.baselines.drrt.dynamic_rrt import AreFree
 from apex_ompl.kernel.compiled.graph_search import shortest_path
 from apex_ompl.types import Array, Flags, Indices
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """An undirected graph of states; each edge is stored in both directions, by the node that it begins at.
+    """An undirected graph of states; each edge is stored in both directions, by the node that it starts at.
 
     Attributes:
         states: States of the nodes, shape (N, dof).
-        begins: First edge of each node, shape (N + 1,).
+        first_edges: First edge of each node, shape (N + 1,).
         ends: Node that each edge leads to, shape (E,).
         twins: The same edge in the other direction, shape (E,).
         lengths: Euclidean length of each edge, shape (E,) [rad].
     """
 
     states: Array
-    begins: Indices
+    first_edges: Indices
     ends: Indices
     twins: Indices
     lengths: Array
@@ -43,14 +43,14 @@ class Graph:
         both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
         keys = np.unique(both[both[:, 0] != both[:, 1]] @ np.array([count, 1]))
         first, ends = np.divmod(keys, count)
-        begins = np.searchsorted(first, np.arange(count + 1))
+        first_edges = np.searchsorted(first, np.arange(count + 1))
         twins = np.searchsorted(keys, ends * count + first)
-        return cls(states, begins, ends, twins, np.linalg.norm(states[ends] - states[first], axis=1))
+        return cls(states, first_edges, ends, twins, np.linalg.norm(states[ends] - states[first], axis=1))
 
     @property
     def firsts(self) -> Indices:
-        """Node that each edge begins at, shape (E,)."""
-        return np.repeat(np.arange(len(self.states)), np.diff(self.begins))
+        """Node that each edge starts at, shape (E,)."""
+        return np.repeat(np.arange(len(self.states)), np.diff(self.first_edges))
 
 
 class _Found(NamedTuple):
@@ -158,7 +158,7 @@ class LazySearch:
         self.searches += 1
         graph, (cost, parent, keys, heap) = self.graph, self._buffers
         node = int(shortest_path(
-            graph.begins, graph.ends, graph.lengths, self._usable, self._entry.min(axis=0), self._leave.min(axis=0),
+            graph.first_edges, graph.ends, graph.lengths, self._usable, self._entry.min(axis=0), self._leave.min(axis=0),
             self._heuristic, cost, parent, keys, heap,
         ))  # fmt: skip
         if node < 0:
@@ -180,7 +180,7 @@ class LazySearch:
         self._hit[left[~free]] = True
         for k in left[~free]:
             self._entry[:, k] = self._leave[:, k] = np.inf
-            out = np.arange(self.graph.begins[k], self.graph.begins[k + 1])
+            out = np.arange(self.graph.first_edges[k], self.graph.first_edges[k + 1])
             self._usable[out] = self._usable[self.graph.twins[out]] = 0
         return bool(free.all())
 

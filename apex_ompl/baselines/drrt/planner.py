@@ -12,8 +12,7 @@ from ompl import base as ob
 from ompl import util as ou
 
 from apex_ompl.apex.start_goal import read_goals, read_starts
-from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
-from apex_ompl.baselines.drrt.goal_tree import GoalTree
+from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT, GoalTree
 from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
@@ -66,7 +65,7 @@ class DRRT(OwnPlanner):
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.removed = 0
-        si, begin = self.getSpaceInformation(), time.perf_counter()
+        si, started = self.getSpaceInformation(), time.perf_counter()
         dof, inputs = int(si.getStateDimension()), self.getPlannerInputStates()
         starts = read_starts(inputs, dof)
         goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
@@ -80,7 +79,7 @@ class DRRT(OwnPlanner):
         rng, box = np.random.default_rng(first + self._solves), si.getStateSpace().getBounds()
         self._solves += 1
         lower, upper = np.array(box.low), np.array(box.high)
-        tree = self.search.begin(np.stack(goals))
+        tree = self.search.rooted_at(np.stack(goals))
         with self.report.timed("trim"):
             self._trim(tree)
         with self.report.timed("grow"):
@@ -91,7 +90,7 @@ class DRRT(OwnPlanner):
         if path is None:
             self.report.reason = f"no path by a tree of {len(tree)} nodes in the time given"
             return Status.TIMEOUT
-        self.report.solved_by, self.report.first = NAME, time.perf_counter() - begin
+        self.report.solved_by, self.report.first = NAME, time.perf_counter() - started
         self.report.first_path = self.report.best_path = Path(path)
         self.report.lengths.append((self.report.first, self.report.best_path.length))
         self.getProblemDefinition().addSolutionPath(array_to_path(si, path), False, 0.0, NAME)

@@ -22,8 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.baselines.gpmp.block_tridiagonal import BlockTridiagonal
-from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
+from apex_ompl.baselines.gpmp.gaussian_process import BlockTridiagonal, GaussianProcess
 from apex_ompl.kernel.clearance_costs import ClearanceCosts
 from apex_ompl.types import Array
 

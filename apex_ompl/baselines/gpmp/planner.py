@@ -210,7 +210,7 @@ class GaussianProcessPlanner(OwnPlanner):
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.validator, self.optima = self.validator.current(), []
         validator, checker = self.validator, self.validator.checker
-        begin, report, inputs = time.perf_counter(), self.report, self.getPlannerInputStates()
+        started, report, inputs = time.perf_counter(), self.report, self.getPlannerInputStates()
         lower, upper = bounds_of(self.getSpaceInformation(), checker.robot)
         starts = read_starts(inputs, len(lower))
         goals = read_goals(inputs, len(lower), ptc, self.getProblemDefinition().getGoal())
@@ -233,7 +233,7 @@ class GaussianProcessPlanner(OwnPlanner):
                 proved = proof is None or bool(proof)
                 valid = proved and validator.accepts(path.states, lambda: bool(ptc()))
             if valid:
-                self._add(path, time.perf_counter() - begin)
+                self._add(path, time.perf_counter() - started)
                 return Status.EXACT_SOLUTION
             report.reason = report.reason or (
                 NOT_ACCEPTED if proof is None or proved else self._fault(path, proof, optimum)

@@ -12,17 +12,16 @@ from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
 from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Factors, Optimum
 from apex_ompl.baselines.gpmp.planner import GPMP, GPMP2, GaussianProcessParameters
 from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
-from apex_ompl.moving.charges import Charges
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
-from apex_ompl.moving.search import STATES, Guess, Search, least_duration
-from apex_ompl.moving.sources import rest_of_route
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import RunContext
+from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
+from apex_ompl.moving.search import STATES, Guess, Search, least_duration, rest_of_route
 from apex_ompl.moving.timed_spline import PINNED, Start, TimedSpline
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.types import Array
 
-CHARGE = "state of a factor graph"
+WORK = "state of a factor graph"
 KNOT_SPACING = 0.08  # that is aimed at [s]
 SLOWER = 1.01  # factor on the duration of a motion that exceeds its limits, beyond what its own shape asks for
 
@@ -56,25 +55,25 @@ class IncrementalGPMP2:
     rounds: int = 4
     goals: int = 2
 
-    def prepare(self, ready: Ready) -> None:
+    def prepare(self, context: RunContext) -> None:
         """Load or compile what it needs."""
-        clearance_costs(ready.kernel, ready.setup.start, 0.01, 0.01)
+        clearance_costs(context.kernel, context.setup.start, 0.01, 0.01)
 
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+    def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
         """Return the first motion that is proved among what is expected, or none."""
-        search = Search(ready, request, charges)
+        search = Search(context, request, budget)
         for part, guess in self.guesses(search):
             for factor in self.factors:
-                if charges.over():
-                    return Answer(None, "", charges)
+                if budget.over():
+                    return Answer(None, "", budget)
                 motion = self.motion(search, guess, factor * guess.duration)
                 if motion is not None:
-                    return Answer(search.following(motion), part, charges)
-        return Answer(None, "", charges)
+                    return Answer(search.following(motion), part, budget)
+        return Answer(None, "", budget)
 
     def guesses(self, search: Search) -> Iterator[tuple[str, Guess]]:
         """Yield motions to begin from, and what they are."""
-        limits, rest = search.ready.limits, rest_of_route(search)
+        limits, rest = search.context.limits, rest_of_route(search)
         if rest is not None:
             yield "route", Guess(rest, rest[-1], least_duration(rest, limits))
         for goal in search.goals[: self.goals]:
@@ -83,21 +82,21 @@ class IncrementalGPMP2:
 
     def motion(self, search: Search, guess: Guess, duration: float) -> Trajectory | None:
         """Return a proved motion that is about as long as asked for [s], or longer where limits ask for it, or None."""
-        supports, limits = self.supports(search, guess, duration), search.ready.limits
+        supports, limits = self.supports(search, guess, duration), search.context.limits
         for _ in range(self.rounds):
             problem = self.problem(search, duration)
-            best = self.optimum(problem, supports, search.charges.over)
-            search.charges.charge(CHARGE, best.evaluations * len(problem.times))
-            search.charges.charge("straight motion")
+            best = self.optimum(problem, supports, search.budget.over)
+            search.budget.spend(WORK, best.evaluations * len(problem.times))
+            search.budget.spend("straight motion")
             spline = spline_of(problem, best.supports, search.start)
             slower = least_knot_spacing(spline.control, limits) / spline.spacing
             if slower > 1.0:
                 spline = spline.lasting(SLOWER * slower * spline.spacing)
             if least_knot_spacing(spline.control, limits) <= spline.spacing:
-                motion = spline.trajectory(search.ready.names)
+                motion = spline.trajectory(search.context.names)
                 if search.accepts(motion):
                     return motion
-            if slower <= SLOWER or search.charges.over():
+            if slower <= SLOWER or search.budget.over():
                 return None
             supports = best.supports.copy()
             supports[1:-1, 1] /= slower
@@ -125,7 +124,7 @@ class IncrementalGPMP2:
 
     def terms(self, search: Search, duration: float) -> tuple[Any, ...]:
         """Return what :class:`apex_ompl.baselines.gpmp.optimizer.Factors` takes, of motions that last so long [s]."""
-        p, request, kernel, limits = self.parameters, search.request, search.ready.kernel, search.ready.limits
+        p, request, kernel, limits = self.parameters, search.request, search.context.kernel, search.context.limits
         process = GaussianProcess(p.intervals, duration, p.power / duration**3)
 
         def clearances(states: Array, times: Array) -> ClearanceCosts:
@@ -179,3 +178,7 @@ def spline_of(problem: Factors, supports: Array, start: Start) -> TimedSpline:
     control[-PINNED:] = supports[-1, 0]
     spacing = problem.process.spacing / count
     return TimedSpline(control, spacing, start).lasting(spacing)
+
+
+register("gpmp2", IncrementalGPMP2, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)", ONE_PLAN)
+register("gpmp", IncrementalGPMP, "GPMP from the moving robot: steps along the functional gradient", ONE_PLAN)

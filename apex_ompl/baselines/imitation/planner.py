@@ -63,7 +63,7 @@ class ImitationPlanner(OwnPlanner):
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.validator = self.validator.current()
-        report, begin, dof = self.report, time.perf_counter(), self.validator.checker.robot.dof
+        report, started, dof = self.report, time.perf_counter(), self.validator.checker.robot.dof
         inputs = self.getPlannerInputStates()
         starts = read_starts(inputs, dof)
         if not starts:
@@ -82,7 +82,7 @@ class ImitationPlanner(OwnPlanner):
             if found is None:
                 continue
             path, report.solved_by = found
-            report.first = time.perf_counter() - begin
+            report.first = time.perf_counter() - started
             report.first_verified, report.first_path, report.best_path = True, path, path
             report.lengths.append((report.first, path.length))
             solution = array_to_path(self.getSpaceInformation(), path.states)

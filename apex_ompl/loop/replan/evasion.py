@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from apex_ompl.errors import ApexError
+from apex_ompl.moving.context import Following
 from apex_ompl.moving.dynamic_obstacles import clearance_in_time
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.search import Search
+from apex_ompl.moving.search import Search, rest_of_route
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
 
@@ -51,37 +52,37 @@ def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
         search: The replan.
         proved: Whether only a motion that is proved is of use.
     """
-    request, ready = search.request, search.ready
-    q, limits, hold = search.start.position, ready.setup.robot.limits, ready.settings.rest_hold
+    request, context = search.request, search.context
+    q, limits, hold = search.start.position, context.setup.robot.limits, context.settings.rest_hold
     size = np.repeat(STRAYS, AROUND // len(STRAYS))[:, None]
     states = q + size * search.rng.normal(size=(len(size), len(q)))
     looks = search.soonest + DURATION + np.linspace(0.0, hold, LOOKS)
     rows = np.arange(len(states))
     for turn in range(ASCENTS + 1):
         states = np.clip(states, limits.lower, limits.upper)
-        states[:, ready.fingers] = q[ready.fingers]
+        states[:, context.fingers] = q[context.fingers]
         clear, slopes = _looked(search, states, looks)
         if turn < ASCENTS:  # away from what comes nearest
             slope = slopes[rows, clear.argmin(axis=1)]
             states = states + STRIDE * slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
     back = _back(search)
     states, clear = np.concatenate([states, back]), np.concatenate([clear, _looked(search, back, looks)[0]])
-    near = np.minimum(clear.min(axis=1), ready.kernel.clearance(states, SEEN).min(axis=1))
-    search.charges.charge("clearance in time", len(states))
+    near = np.minimum(clear.min(axis=1), context.kernel.clearance(states, SEEN).min(axis=1))
+    search.budget.spend("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
     best, unproved, latest = None, None, request.conflict + GAIN
-    proves = request.reachable if ready.settings.evade == "proved" else None
+    proves = request.reachable if context.settings.evade == "proved" else None
     for k in np.argsort(-(near - NEARNESS * size), kind="stable"):
-        if search.charges.over():
+        if search.budget.over():
             break
         motion = _to(search, states[k])
         if motion is None:
             continue
         one = search.following(motion)
-        conflict = ready.first_conflict(request.predicted, one, one.begin, one.end + hold, search.charges)
-        if conflict <= latest or not ready.clear_of_still(motion, search.charges):
+        conflict = context.first_conflict(request.predicted, one, one.start_time, one.end + hold, search.budget)
+        if conflict <= latest or not context.clear_of_static(motion, search.budget):
             continue
-        if proves is not None and not ready.proved_to_rest(proves, Following(motion, search.soonest), search.charges):
+        if proves is not None and not context.proved_to_rest(proves, Following(motion, search.soonest), search.budget):
             unproved = motion if unproved is None else unproved
             continue
         best, latest = motion, conflict
@@ -94,9 +95,9 @@ def _to(search: Search, state: Array) -> Trajectory | None:
     """Return the motion to a state, shape (dof,), or None where there is none within the limits."""
     if search.start.moves:
         return search.direct(state)
-    search.charges.charge("straight motion")
+    search.budget.spend("straight motion")
     states = np.stack([search.start.position, state])
-    return time_path(states, search.ready.limits, search.ready.names).trajectory
+    return time_path(states, search.context.limits, search.context.names).trajectory
 
 
 def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
@@ -112,15 +113,15 @@ def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
     Returns:
         Clearances, shape (N, T) or (N, T + 1), and gradients, shape (N, T or T + 1, dof).
     """
-    ready, request, count = search.ready, search.request, len(states)
+    context, request, count = search.context, search.request, len(states)
     asked = [(request.predicted, looks)]
-    if request.reachable is not None and ready.settings.evade == "proved":
+    if request.reachable is not None and context.settings.evade == "proved":
         asked.append((request.reachable, looks[:1]))
     clear, slopes = list[Array](), list[Array]()
     for dynamic, times in asked:
         many = np.repeat(states, len(times), axis=0)
-        values, gradients = clearance_in_time(ready.kernel, dynamic, many, np.tile(times, count), SEEN)
-        search.charges.charge("clearance in time", len(values))
+        values, gradients = clearance_in_time(context.kernel, dynamic, many, np.tile(times, count), SEEN)
+        search.budget.spend("clearance in time", len(values))
         clear.append(values.reshape(count, -1))
         slopes.append(gradients.reshape(count, len(times), -1)[:, :, :-1])
     return np.concatenate(clear, axis=1), np.concatenate(slopes, axis=1)
@@ -128,8 +129,48 @@ def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
 
 def _back(search: Search) -> Array:
     """Return the states that a robot may go back to, shape (N, dof)."""
-    ready, route = search.ready, search.request.route
-    begun = ready.setup.start[None]
+    context, route = search.context, search.request.route
+    started = context.setup.start[None]
     if route is None:
-        return begun
-    return np.concatenate([begun, route.motion(np.linspace(0.0, route.motion.duration, BACK))])
+        return started
+    return np.concatenate([started, route.motion(np.linspace(0.0, route.motion.duration, BACK))])
+
+
+SHARES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.15)  # of the way to a goal, the nearest to it first
+NEAREST_GOALS = 2  # nearest goals to which that is tried
+LEAST_NEARER = 0.1  # distance that a robot comes nearer to a goal at least [rad]
+
+
+def wait_nearer(search: Search) -> Trajectory | None:
+    """Return a motion from rest to a state nearer to a goal that stays clear for a while, or None.
+
+    The states are on the straight lines to the nearest goals, and on what is left of the last motion to a goal; the
+    robot goes straight to them.
+    """
+    q, context = search.start.position, search.context
+    for state in _waiting_states(search):
+        if search.budget.over():
+            return None
+        search.budget.spend("straight motion")
+        try:
+            motion = time_path(np.stack([q, state]), context.limits, context.names).trajectory
+        except ApexError:
+            continue
+        if search.accepts(motion):
+            return motion
+    return None
+
+
+def _waiting_states(search: Search) -> Array:
+    """Return the states where it may wait, shape (N, dof), the nearest to a goal first."""
+    q, goals = search.start.position, search.goals
+    ways = [q + np.array(SHARES)[:, None] * (goal - q) for goal in goals[:NEAREST_GOALS]]
+    rest = rest_of_route(search)
+    if rest is not None:
+        ways.append(rest[np.rint(np.array(SHARES) * (len(rest) - 1)).astype(int)])
+    states = np.concatenate(ways)
+    left = np.linalg.norm(states[:, None] - goals, axis=2).min(axis=1)
+    now = np.linalg.norm(goals - q, axis=1).min()
+    order = np.argsort(left, kind="stable")
+    found: Array = states[order][left[order] <= now - LEAST_NEARER]
+    return found

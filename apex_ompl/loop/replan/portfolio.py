@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
-from apex_ompl.loop.replan.evasion import URGENT, endangered, step_aside, threatened
-from apex_ompl.loop.replan.quickening import quickened
-from apex_ompl.loop.replan.waiting import wait_nearer
-from apex_ompl.moving.charges import Charges
-from apex_ompl.moving.motion_pool import ROUNDS, MotionCandidate, MotionPool
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
+import numpy as np
+
+from apex_ompl.loop.replan.evasion import URGENT, endangered, step_aside, threatened, wait_nearer
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import RunContext
+from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.search import Search, Source
+from apex_ompl.moving.timed_spline import MOST_ROUNDS, MotionCandidate, MotionPool
 from apex_ompl.timing import Trajectory
+from apex_ompl.timing.moving_start import through
 from apex_ompl.types import Array
 
 FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
@@ -46,27 +48,27 @@ class Portfolio:
     waits: bool = True
     carried: list[tuple[MotionCandidate, float]] = field(default_factory=list)
 
-    def prepare(self, ready: Ready) -> None:
+    def prepare(self, context: RunContext) -> None:
         """Load what the sources need, and forget earlier runs."""
         self.carried = []
         for source in self.sources:
-            source.prepare(ready)
+            source.prepare(context)
 
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+    def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
         """Return a motion from the time of joining on that is proved among what is expected, or none."""
-        search = Search(ready, request, charges)
-        evade, danger = ready.settings.evade, (request.following, request.join, request.contact)
+        search = Search(context, request, budget)
+        evade, danger = context.settings.evade, (request.following, request.join, request.contact)
         comes = self.evades and evade != "never" and endangered(*danger)
         urgent = comes and endangered(*danger, URGENT)
         if urgent and self._step_aside(search):
-            return Answer(search.best, search.part, charges)
+            return Answer(search.best, search.part, budget)
         aside, waits = comes and not urgent, not comes and self.waits and not request.hastens
         waits = waits and request.following.at_rest(request.join)
         fallback = step_aside(search, proved=True) if aside and evade == "proved" else None
         flees = self.evades and evade != "never" and threatened(request.following, request.join, request.conflict)
         aside = aside or (flees and request.reachable is not None)
         if (aside and fallback is None) or waits:
-            search.until = (WAITING if waits else ASIDE) * charges.limit  # some time is left for that
+            search.until = (WAITING if waits else ASIDE) * budget.limit  # some time is left for that
         if self.retimes:
             motion = retimed(search)
             if motion is not None:
@@ -76,7 +78,7 @@ class Portfolio:
             if motion is not None:
                 search.take(motion, "direct")
         if self.sources and search.request.hastens:
-            quicken(search, request.following.piece(request.join, request.following.end))
+            take_faster(search, request.following.piece(request.join, request.following.end))
         if self.sources and not search.over():
             self._optimize(search)
         if search.best is None and fallback is not None:
@@ -85,7 +87,7 @@ class Portfolio:
             self._step_aside(search)
         if search.best is None and waits:
             self._wait_nearer(search)
-        return Answer(search.best, search.part, charges)
+        return Answer(search.best, search.part, budget)
 
     @staticmethod
     def _step_aside(search: Search) -> bool:
@@ -110,8 +112,8 @@ class Portfolio:
         hastens = search.request.hastens
         if not hastens:
             carried, self.carried = self.carried, []
-            for one, begun in carried:
-                pool.carry(one, search.request.join - begun)
+            for one, started in carried:
+                pool.carry(one, search.request.join - started)
         turn = search.request.number % len(self.sources) if hastens else 0
         sources = iter([*self.sources[turn:], *self.sources[:turn]])
         while not search.over():
@@ -120,13 +122,13 @@ class Portfolio:
                 break
             if source is not None and len(pool.candidates) < ENOUGH:
                 self._ask(source, search, pool)
-            left = search.charges.limit - search.charges.spent
-            until = search.charges.spent + (SHARE * left if source is not None else left)
+            left = search.budget.limit - search.budget.spent
+            until = search.budget.spent + (SHARE * left if source is not None else left)
             if not self._improve(search, pool, min(until, search.until)) and source is None:
                 break
         if hastens:
             return
-        open_ones = [one for one in pool.candidates if not one.given_up and one.rounds < ROUNDS]
+        open_ones = [one for one in pool.candidates if not one.given_up and one.rounds < MOST_ROUNDS]
         open_ones.sort(key=lambda one: one.priority)
         self.carried = [(one, search.request.join) for one in open_ones[:CARRIED]]
 
@@ -135,7 +137,7 @@ class Portfolio:
         """Take the motions of a source into the pool."""
         for guess in source.guesses(search):
             for factor in (1.0,) if guess.timed else FACTORS[search.request.number % len(FACTORS)]:
-                if search.charges.over():
+                if search.budget.over():
                     return
                 least = factor * guess.duration
                 if least >= search.wanted():
@@ -151,32 +153,34 @@ class Portfolio:
         while True:
             found = pool.improve(search.wanted, until)
             if found is None:
-                return search.charges.spent >= until
+                return search.budget.spent >= until
             if search.take(found[1], found[0].origin):
-                quicken(search, found[1])
+                take_faster(search, found[1])
             if search.over():
                 return False
 
 
-def quicken(search: Search, motion: Trajectory) -> None:
+def take_faster(search: Search, motion: Trajectory) -> None:
     """Take a faster motion through states of one that is proved, where there is one that is proved, too."""
-    for faster in quickened(search, motion):
+    for faster in faster_motions(search, motion):
         if search.accepts(faster) and search.take(faster, "quicken"):
             return
 
 
 def straight(search: Search, goal: Array) -> Trajectory | None:
     """Return the direct motion to a goal, or a slower or retimed one, that is proved, or None."""
-    ready, request = search.ready, search.request
+    context, request = search.context, search.request
     fastest = search.direct(goal)
     if fastest is None or fastest.duration <= 0.0 or fastest.duration >= search.wanted():
         return None
-    if not ready.clear_of_still(fastest, search.charges):
+    if not context.clear_of_static(fastest, search.budget):
         return None
     if search.accepts(fastest):
         return fastest
-    made = retime(ready.kernel, request.predicted, fastest, ready.limits, clock=request.join, hold=ready.settings.hold)
-    search.charges.charge("retiming")
+    made = retime(
+        context.kernel, request.predicted, fastest, context.limits, clock=request.join, hold=context.settings.hold
+    )
+    search.budget.spend("retiming")
     slow = made.trajectory
     if slow is not None and slow.duration < search.wanted() and search.accepts(slow):
         return slow
@@ -185,13 +189,42 @@ def straight(search: Search, goal: Array) -> Trajectory | None:
 
 def retimed(search: Search) -> Trajectory | None:
     """Return the rest of the motion at another speed, where it goes to a goal and that is proved, or None."""
-    ready, request = search.ready, search.request
+    context, request = search.context, search.request
     following = request.following
     if not following.to_goal or following.at_rest(request.join):
         return None
     made = retime(
-        ready.kernel, request.predicted, following.motion, ready.limits, time=request.join - following.begin,
-        clock=request.join, hold=ready.settings.hold,
+        context.kernel, request.predicted, following.motion, context.limits, time=request.join - following.start_time,
+        clock=request.join, hold=context.settings.hold,
     )  # fmt: skip
-    search.charges.charge("retiming")
+    search.budget.spend("retiming")
     return made.trajectory if made.trajectory is not None and search.accepts(made.trajectory) else None
+
+
+TRIES = ((2, 1.25), (3, 1.25), (2, 1.0), (4, 1.1), (3, 1.0))  # numbers of pieces, and factors on the speed between them
+LIMIT_SHARE = 0.98  # of the limits that speeds and accelerations between pieces have at most
+
+
+def faster_motions(search: Search, motion: Trajectory) -> Iterator[Trajectory]:
+    """Yield faster motions through states of a motion, which begins when the robot joins it and ends at rest.
+
+    Each is in a few pieces, the fastest between their states by Ruckig (Berscheid and Kroeger 2021). Splines cannot
+    change their acceleration as quickly as the limits of jerk allow.
+
+    Args:
+        search: The replan under way.
+        motion: The motion.
+    """
+    limits, names, duration = search.context.limits, search.context.names, motion.duration
+    solve = partial(search.budget.spend, "piece of a motion")
+    for pieces, factor in TRIES:
+        if search.over() or duration <= 0.0:
+            return
+        states = motion.states(np.linspace(0.0, duration, pieces + 1))
+        for order, most in ((1, limits.velocity), (2, limits.acceleration)):
+            states[order] = np.clip(factor**order * states[order], -LIMIT_SHARE * most, LIMIT_SHARE * most)
+        states[:, 0], states[:, -1] = search.start, (motion.positions[-1], 0.0 * most, 0.0 * most)
+        faster = through(states, limits, names, search.wanted(), solve)
+        if faster is not None and faster.duration > 0.0:
+            search.budget.spend("joined motion")
+            yield faster

@@ -1,4 +1,4 @@
-"""The clock on the wall: steps are decided while the one before is under way, and one that is late is a proved stop."""
+"""The simulated clock: steps at its period, whatever they take, with work that is charged by counts."""
 
 from __future__ import annotations
 
@@ -10,23 +10,49 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
-from apex_ompl.loop.cycle import Eyes, Loop, RunRecord
-from apex_ompl.loop.late_steps import Decided, undo
-from apex_ompl.loop.observation import Observation
-from apex_ompl.loop.planner_process import PlannerProcess
+from apex_ompl.loop.cycle import Decided, Loop, RunRecord, undo
+from apex_ompl.loop.environment import Environment, Observation, ObservationSource
+from apex_ompl.loop.replanning import ImmediateReplanning, PlannerProcess
 from apex_ompl.loop.tracking import Tracker
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Request
-from apex_ompl.problems.worlds import World
+from apex_ompl.moving.context import Following, RunContext
+from apex_ompl.moving.replanner import Replanner, Request
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing
 from apex_ompl.timing import time_path
 from apex_ompl.util.cores import usable_cores
 from apex_ompl.util.exiting import running
+
+
+def simulate(
+    environment: Environment, context: RunContext, replanner: Replanner, sensor: ObservationSource, seed: int
+) -> RunRecord:
+    """Run the loop in a world until the robot stands at a goal, or time is up.
+
+    Args:
+        world: What truly happens.
+        context: The robot among what stands still.
+        replanner: How motions are planned anew.
+        eyes: What observes the world.
+        seed: Of random choices.
+    """
+    loop = Loop(environment, context, ImmediateReplanning(context, replanner), sensor, seed)
+    with running(loop.abort):
+        for k in count():
+            now, before = k * context.settings.period, Decided.of(loop.executor)
+            try:
+                loop.advance(now)
+                loop.observe(now)
+                ended = loop.step(now)
+                if ended is not None:
+                    return ended
+                loop.announce_start(now)
+            except KeyboardInterrupt:
+                loop.interrupt(now, before)
+    raise AssertionError("unreachable")
 
 
 def cores() -> tuple[int | None, int | None]:
@@ -54,23 +80,27 @@ def undisturbed(core: int | None) -> Iterator[None]:
             gc.enable()
 
 
-def warm_up(ready: Ready, world: World, seed: int) -> None:
+def warm_up(context: RunContext, environment: Environment, seed: int) -> None:
     """Do once what a step does, so that compiled functions are loaded before the clock runs."""
-    present = tuple(world.present(0.0)) or (Obstacle(name="warm-up", box=(0.1, 0.1, 0.1), position=(9.0, 9.0, 9.0)),)
-    tracker = Tracker(ready.kernel)
+    present = tuple(environment.present(0.0)) or (
+        Obstacle(name="warm-up", box=(0.1, 0.1, 0.1), position=(9.0, 9.0, 9.0)),
+    )
+    tracker = Tracker(context.kernel)
     tracker.take(Observation(0.0, 0.0, tuple(standing(o) for o in present)))
-    motion = time_path(np.stack([ready.setup.start, ready.goals[0]]), ready.limits, ready.names).trajectory
+    motion = time_path(np.stack([context.setup.start, context.goals[0]]), context.limits, context.names).trajectory
     line = Following(motion, 0.0, to_goal=True)
-    predicted, half = tracker.predicted(ready.settings.margin), 0.5 * motion.duration
-    tracker.eased(predicted, ready.setup.start, [0.0])
-    ready.first_conflict(predicted, line, 0.0, line.end)
-    ready.proved_stop(tracker.reachable(0.0, 0.0), line, half, half + ready.settings.period)
-    ready.clear_of_still(motion)
+    predicted, half = tracker.predicted(context.settings.margin), 0.5 * motion.duration
+    tracker.eased(predicted, context.setup.start, [0.0])
+    context.first_conflict(predicted, line, 0.0, line.end)
+    context.proved_stop(tracker.reachable(0.0, 0.0), line, half, half + context.settings.period)
+    context.clear_of_static(motion)
     request = Request(1, 0.0, 0.05, line, line, predicted, 0.01, present, np.inf, seed)
     pickle.loads(pickle.dumps((request, line.piece(half, line.end))))
 
 
-def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: Eyes, seed: int) -> RunRecord:
+def run_in_real_time(
+    environment: Environment, context: RunContext, planner: PlannerProcess, sensor: ObservationSource, seed: int
+) -> RunRecord:
     """Run the loop by the clock on the wall until the robot stands at a goal, or time is up.
 
     The step at a time is decided in the period before it, by what was seen until that began. What a driver has is the
@@ -79,7 +109,7 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
 
     Args:
         world: What truly happens.
-        ready: The robot among what stands still.
+        context: The robot among what stands still.
         planner: The process that makes replans, which is ready.
         eyes: What observes the world.
         seed: Of random choices.
@@ -89,12 +119,12 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
         decided [s], without those for which the world and its sensor were simulated, and ``deadline_misses``, the
         number of steps that were not decided in time.
     """
-    period = ready.settings.period
-    loop = Loop(world, ready, planner, eyes, seed, lead=period)
+    period = context.settings.period
+    loop = Loop(environment, context, planner, sensor, seed, lead=period)
     executor, ticks = loop.executor, list[float]()
     k, missed = 0, 0
     ended: RunRecord | None = None
-    warm_up(ready, world, seed)
+    warm_up(context, environment, seed)
     with undisturbed(cores()[0]), running(loop.abort):
         began = time.perf_counter()
         while ended is None:
@@ -119,12 +149,12 @@ def run_in_real_time(world: World, ready: Ready, planner: PlannerProcess, eyes: 
                     undo(executor, then, before)
                     missed += 1
                 paused = time.perf_counter()
-                loop.set_out(then)
+                loop.announce_start(then)
                 began += time.perf_counter() - paused
             except KeyboardInterrupt:
                 ended, k = None, round(then / period)
                 loop.interrupt(then, before)
-    world.advance(k * period, executor.state(k * period))  # what the motion is judged by
+    environment.advance(k * period, executor.state(k * period))  # what the motion is judged by
     middle, high, worst = np.percentile(ticks, [50.0, 99.0, 100.0]).tolist()
     measured = {"tick_p50": middle, "tick_p99": high, "tick_worst": worst, "deadline_misses": float(missed)}
     return replace(ended, measured=measured)

@@ -1,8 +1,9 @@
-"""All that a run of the closed loop keeps ready, so that a replan pays for nothing but the plan."""
+"""Motions that a robot follows by a clock, and what it did in the end."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,22 +12,98 @@ from apex_ompl.collision.path_proof import Curve
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.ahead_of_time import compile_ahead
 from apex_ompl.kernel.compiled.entry_points import RUNS
-from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
-from apex_ompl.moving.following import Following
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.moving.stopping import stop, stop_along, stops_proved
+from apex_ompl.moving.timed_spline import Start
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.checks import SAME_STATE
+from apex_ompl.timing.trajectory import concatenate
 from apex_ompl.types import Array
+
+SAME_TIME = 1e-9  # [s]
+
+
+@dataclass(frozen=True, eq=False)
+class Following:
+    """A motion that a robot follows; behind its end it stands.
+
+    Attributes:
+        motion: The motion, which ends at rest.
+        start_time: Time of the clock at which it starts [s].
+        to_goal: Whether it ends at a goal.
+    """
+
+    motion: Trajectory
+    start_time: float
+    to_goal: bool = False
+
+    @classmethod
+    def standing(cls, q: Array, time: float, joint_names: tuple[str, ...], *, to_goal: bool = False) -> Following:
+        """Return rest at a state, shape (dof,), from a time on [s]."""
+        still = np.zeros((1, len(q)))
+        return cls(Trajectory(np.zeros(1), q[None].copy(), still, still, joint_names), time, to_goal)
+
+    @cached_property
+    def end(self) -> float:
+        """Time of the clock from which on the robot stands [s]."""
+        return self.start_time + self.motion.duration
+
+    def after(self, head: Trajectory, start_time: float) -> Following:
+        """Return the motion behind another one, which begins at a time of the clock [s] and ends where it begins."""
+        return Following(concatenate([head, self.motion]), start_time, self.to_goal)
+
+    def at(self, time: float) -> Start:
+        """Return what the robot does at a time of the clock [s]."""
+        at = min(max(time - self.start_time, 0.0), self.motion.duration)
+        if at >= self.motion.duration - SAME_TIME:
+            return Start.at_rest(self.motion.positions[-1].copy())
+        return Start(*self.motion.states(np.array([at]))[:, 0])
+
+    def state(self, time: float) -> Array:
+        """Return the robot's state at a time of the clock, shape (dof,)."""
+        return self.at(time).position
+
+    def at_rest(self, time: float) -> bool:
+        """Whether the robot stands from a time of the clock on [s]."""
+        return time >= self.end - SAME_TIME
+
+    def piece(self, start: float, end: float) -> Trajectory:
+        """Return what the robot does between two times of the clock [s]."""
+        if self.at_rest(start) or end <= self.start_time + SAME_TIME:
+            times = np.array([0.0, end - start] if end > start else [0.0])
+            q = np.repeat(self.motion.positions[[-1 if self.at_rest(start) else 0]], len(times), axis=0)
+            return Trajectory(times, q, np.zeros_like(q), np.zeros_like(q), self.motion.joint_names)
+        if start < self.start_time - SAME_TIME:
+            return concatenate([self.piece(start, self.start_time), self.piece(self.start_time, end)])
+        last = min(end, self.end) - self.start_time
+        first, times = start - self.start_time, self.motion.times
+        inner = times[(times > first + SAME_TIME) & (times < last - SAME_TIME)]
+        at = np.concatenate([[max(first, 0.0)], inner, [last]])
+        q, v, a = self.motion.states(at)
+        moving = Trajectory(at - at[0], q, v, a, self.motion.joint_names)
+        if end - self.end <= SAME_TIME:
+            return moving
+        return concatenate([moving, self.piece(self.end, end)])
+
+
+def executed(followed: list[tuple[float, Following]], end: float) -> Trajectory:
+    """Return what a robot did up to a time, of what it followed from which times on."""
+    ends = [start for start, _ in followed[1:]] + [end]
+    pieces = [
+        one.piece(start, until) for (start, one), until in zip(followed, ends, strict=True) if until > start + SAME_TIME
+    ]
+    return concatenate(pieces) if pieces else followed[-1][1].motion
+
 
 GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
 
 
 @dataclass(eq=False)
-class Ready:
+class RunContext:
     """The robot among what stands still.
 
     Attributes:
@@ -75,24 +152,24 @@ class Ready:
         """Whether a state, shape (dof,), is a goal, as the referee sees it: stops may end that near to one."""
         return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) <= SAME_STATE).any())
 
-    def clear_of_still(self, motion: Trajectory, charges: Charges | None = None) -> bool:
+    def clear_of_static(self, motion: Trajectory, budget: ComputeBudget | None = None) -> bool:
         """Whether a motion keeps the limits, and is proved as by :meth:`is_clear`."""
-        return self.keeps_limits(motion) and self.is_clear(curve_of(motion), charges)
+        return self.keeps_limits(motion) and self.is_clear(curve_of(motion), budget)
 
-    def is_clear(self, curve: Curve, charges: Charges | None = None) -> bool:
+    def is_clear(self, curve: Curve, budget: ComputeBudget | None = None) -> bool:
         """Whether a curve is proved free of what stands still and of the robot itself.
 
         It does not graze either, but where it begins like that: pieces of it are proved again where they are joined.
         """
         proof = self.checker.prove(curve, tolerance=0.0)
-        if charges is not None:
-            charges.charge("proof interval", proof.intervals)
-            charges.charge("exact proof", int(proof.by_spheres < 1.0))
+        if budget is not None:
+            budget.spend("proof interval", proof.intervals)
+            budget.spend("exact proof", int(proof.by_spheres < 1.0))
         return bool(proof) and (proof.clearance >= GRAZING or self._touches(curve.states[0]))
 
-    def line_is_clear(self, first: Array, last: Array, charges: Charges | None = None) -> bool:
+    def line_is_clear(self, first: Array, last: Array, budget: ComputeBudget | None = None) -> bool:
         """Whether the straight motion between two states, shape (dof,), is proved as by :meth:`is_clear`."""
-        return self.is_clear(Curve.polyline(np.stack([first, last])), charges)
+        return self.is_clear(Curve.polyline(np.stack([first, last])), budget)
 
     def _touches(self, q: Array) -> bool:
         """Whether what stands still or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
@@ -108,34 +185,36 @@ class Ready:
         self,
         dynamic: DynamicObstacles,
         following: Following,
-        begin: float,
+        start: float,
         until: float,
-        charges: Charges | None = None,
+        budget: ComputeBudget | None = None,
     ) -> float:
         """Return the clock time at which a motion can no longer be proved clear of dynamic obstacles [s], or infinity.
 
         Args:
             dynamic: The obstacles.
             following: The motion.
-            begin: Time of the clock from which on it is looked at [s].
+            start: Time of the clock from which on it is looked at [s].
             until: Time until which it is looked at [s], behind its end, too.
-            charges: Gets the number of intervals.
+            budget: Gets the number of intervals.
         """
-        zero = following.begin
-        found = prove_motion(self.kernel, dynamic, following.motion, begin - zero, until - zero, clock=zero)
-        if charges is not None:
-            charges.charge("interval among dynamic obstacles", found.intervals)
+        zero = following.start_time
+        found = prove_motion(self.kernel, dynamic, following.motion, start - zero, until - zero, clock=zero)
+        if budget is not None:
+            budget.spend("interval among dynamic obstacles", found.intervals)
         return found.time + zero
 
-    def proved_to_rest(self, reachable: DynamicObstacles, following: Following, charges: Charges | None = None) -> bool:
+    def proved_to_rest(
+        self, reachable: DynamicObstacles, following: Following, budget: ComputeBudget | None = None
+    ) -> bool:
         """Whether nothing that obstacles can reach comes in the way of a motion until the robot is at rest again.
 
         Args:
             reachable: The obstacles, as large as all that they can reach.
             following: The motion.
-            charges: Gets the number of intervals.
+            budget: Gets the number of intervals.
         """
-        return bool(np.isinf(self.first_conflict(reachable, following, following.begin, following.end, charges)))
+        return bool(np.isinf(self.first_conflict(reachable, following, following.start_time, following.end, budget)))
 
     def proved_stop(
         self, reachable: DynamicObstacles, following: Following, now: float, then: float
@@ -183,7 +262,7 @@ class Ready:
         settings = self.settings
         error, fastest = settings.assumed
         count, by_joints = stops_proved(
-            self.kernel, predicted, following.motion, self.stopping, moments - following.begin, clock=following.begin,
+            self.kernel, predicted, following.motion, self.stopping, moments - following.start_time, clock=following.start_time,
             age=age, growth=(error + spread, fastest), period=settings.period,
         )  # fmt: skip
         left = np.flatnonzero(by_joints[:count])
@@ -194,19 +273,19 @@ class Ready:
 
     def unproved_stop(self, following: Following, then: float) -> Following:
         """Return a stop from a motion along its path from a time of the clock on [s]."""
-        made = stop_along(following.motion, then - following.begin, self.stopping)
+        made = stop_along(following.motion, then - following.start_time, self.stopping)
         return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))
 
     def clear_stop(self, following: Following, then: float, along: bool) -> Following | None:
         """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
-        at = then - following.begin
+        at = then - following.start_time
         if along:
             made = stop_along(following.motion, at, self.stopping)
             ends_there = abs(made.trajectory.duration - (following.motion.duration - at)) < 1e-9
             if ends_there:  # the rest of the motion itself, which is proved
                 return Following(made.trajectory, then, following.to_goal)
         else:
-            start = following.start(then)
+            start = following.at(then)
             made = stop(self.stopping, self.names, *start)
             if not made.within_limits:
                 return None

@@ -1,0 +1,234 @@
+"""Fresh proposals of a trajectory model while the robot moves, with obstacles where they will be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from apex_ompl.apex.models import Model, trajectory_model
+from apex_ompl.apex.query import make_query
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.kernel.trees import TreePair
+from apex_ompl.model.query import Query
+from apex_ompl.moving.context import RunContext
+from apex_ompl.moving.search import STATES, Guess, Search, fresh_checker, least_duration, place_nearest, rest_of_route
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.path import resample
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+
+FASTER = (0.92, 0.8)  # shares of the duration of a motion in which a faster one is looked for
+TEMPERATURES = (1.0, 1.6)  # of the noise, in one replan after the other
+
+
+@dataclass(frozen=True)
+class Route:
+    """What is left of the last motion to a goal."""
+
+    name: str = "route"
+
+    def prepare(self, context: RunContext) -> None:
+        """Nothing is needed."""
+
+    def guesses(self, search: Search) -> Iterator[Guess]:
+        """Yield the rest of the route, where there is one."""
+        rest = rest_of_route(search)
+        if rest is not None:
+            yield Guess(rest, rest[-1], least_duration(rest, search.context.limits))
+
+
+@dataclass(frozen=True)
+class Faster:
+    """The motion that is followed, faster."""
+
+    name: str = "faster"
+
+    def prepare(self, context: RunContext) -> None:
+        """Nothing is needed."""
+
+    def guesses(self, search: Search) -> Iterator[Guess]:
+        """Yield the rest of the motion, where it has no conflict."""
+        request = search.request
+        left = request.following.end - request.join
+        if request.hastens and left > 0.0:
+            times = request.join - request.following.start_time + np.linspace(0.0, left, STATES)
+            states = request.following.motion(np.clip(times, 0.0, request.following.motion.duration))
+            for factor in FASTER:
+                yield Guess(states, request.following.motion.positions[-1], factor * left, timed=True)
+
+
+@dataclass(frozen=True)
+class Lines:
+    """Straight lines to the nearest goals, and lines with bumps.
+
+    Attributes:
+        perturbed: Number of lines with bumps for each goal; 0 takes the straight line alone.
+        size: How far they stray [rad].
+        goals: Number of goals.
+    """
+
+    perturbed: int = 0
+    size: float = 0.6
+    goals: int = 2
+    name: str = "line"
+
+    def prepare(self, context: RunContext) -> None:
+        """Nothing is needed."""
+
+    def guesses(self, search: Search) -> Iterator[Guess]:
+        """Yield the lines."""
+        optimizer, fingers = Optimizer(), search.context.fingers
+        for goal in search.goals[: self.goals]:
+            starts = optimizer.starts(search.start.position, goal, 1 + self.perturbed, search.rng, self.size)
+            starts[1:, :, fingers] = starts[0, :, fingers].T
+            for control in starts[1:] if self.perturbed else starts:
+                states = optimizer.spline.path(control)
+                yield Guess(states, goal, least_duration(states, search.context.limits))
+
+
+@dataclass(eq=False)
+class Proposals:
+    """Paths of a latent diffusion model from the state that the robot will be in.
+
+    The model was trained among obstacles that stand still. It is shown each obstacle that moves where it comes nearest
+    to the straight line in time.
+
+    Attributes:
+        model: Name or folder of the checkpoint, see :func:`apex_ompl.apex.models.trajectory_model`.
+        count: Number of proposals.
+    """
+
+    model: str = "auto"
+    count: int = 4
+    name: str = "proposals"
+    _loaded: Model | None = field(default=None, repr=False)
+    _checker: CollisionChecker | None = field(default=None, repr=False)
+
+    def prepare(self, context: RunContext) -> None:
+        """Load the model, and propose something.
+
+        Raises:
+            ApexError: The checkpoint cannot be loaded, or is of another robot.
+        """
+        setup = context.setup
+        self._loaded, self._checker = trajectory_model(self.model, setup.robot.name), fresh_checker(context)
+        query = make_query(self._checker, setup.start, setup.start, point=self._loaded.sees_point)
+        with self._loaded.one_thread():
+            self._loaded.propose(query, self._checker.kernel, self.count)
+
+    @property
+    def model_and_checker(self) -> tuple[Model, CollisionChecker]:
+        """The model and the obstacles that it is shown, after :meth:`prepare`."""
+        assert self._loaded is not None and self._checker is not None
+        return self._loaded, self._checker
+
+    def guesses(self, search: Search) -> Iterator[Guess]:
+        """Yield the proposals."""
+        (model, checker), goals = self.model_and_checker, search.goals
+        if not len(goals):
+            return
+        goal = goals[0]
+        place_nearest(checker, search, goal)
+        query = make_query(checker, search.start.position, goal, point=model.sees_point)
+        with model.one_thread():
+            controls = self._made(search, query)
+        for control in controls:
+            states = model.spline.path(control)
+            yield Guess(states, goal, least_duration(states, search.context.limits))
+
+    def _made(self, search: Search, query: Query) -> Array:
+        """Return control points of proposals, shape (B, points, dof)."""
+        model, checker = self.model_and_checker
+        temperature = TEMPERATURES[search.request.number % len(TEMPERATURES)]
+        sampling = model.sampling
+        made = model.propose(
+            query, checker.kernel, self.count, generator=search.rng,
+            sampling=type(sampling)(sampling.sampler, sampling.steps, temperature, sampling.guidance),
+        )  # fmt: skip
+        search.budget.spend("proposals")
+        search.budget.spend("proposal", self.count)
+        return made.control
+
+
+@dataclass(eq=False)
+class Renoised(Proposals):
+    """What is left of the last motion to a goal, noised and denoised again: the paper's resampling, in flight.
+
+    Attributes:
+        noises: How far it is noised, as shares of the schedule, in one replan after the other.
+    """
+
+    name: str = "renoise"
+    noises: tuple[float, ...] = (0.15, 0.4)
+
+    def _made(self, search: Search, query: Query) -> Array:
+        rest = rest_of_route(search)
+        model, checker = self.model_and_checker
+        if rest is None:
+            return np.empty((0, 0, 0))
+        rest = rest + (search.start.position - rest[0]) * np.linspace(1.0, 0.0, len(rest))[:, None]
+        limits = search.context.limits
+        control = model.spline.fit(rest, limits.lower, limits.upper).control
+        noise = self.noises[search.request.number % len(self.noises)]
+        made = model.renoise(
+            query, checker.kernel, np.repeat(control[None], self.count, axis=0),
+            max(0, round(noise * model.schedule.steps) - 1), generator=search.rng,
+        )  # fmt: skip
+        search.budget.spend("proposals")
+        search.budget.spend("proposal", self.count)
+        return made.control
+
+
+BATCH = 16  # random states between two looks at the charges
+WORK = "state of a tree"
+
+
+@dataclass(eq=False)
+class Sprint:
+    """RRT-Connect in compiled code, for a robot that stands, from the second replan of a run on.
+
+    Its paths are longer than those that other sources begin from, so that they are no way to begin a run.
+    Each obstacle that moves stands where it comes nearest to the straight line in time; where it will touch the robot
+    at the start of the search, there is none.
+
+    Attributes:
+        longest: Longest step of the trees [rad].
+        most: Random states, at most.
+    """
+
+    longest: float = float(TUNED["apex"]["range"])
+    most: int = 1024
+    name: str = "sprint"
+    _checker: CollisionChecker | None = field(default=None, repr=False)
+
+    def prepare(self, context: RunContext) -> None:
+        """Set up a checker of its own."""
+        self._checker = fresh_checker(context)
+
+    def guesses(self, search: Search) -> Iterator[Guess]:
+        """Yield the path of the trees, where they meet in time."""
+        assert self._checker is not None
+        request = search.request
+        if not len(search.goals) or request.number == 1 or not request.following.at_rest(request.join):
+            return
+        place_nearest(self._checker, search, search.goals[0])
+        start = search.start.position
+        free = self._checker.are_free(np.concatenate([start[None], search.goals]))
+        search.budget.spend(WORK, len(free))
+        goals = search.goals[free[1:]]
+        if not free[0] or not len(goals):
+            return
+        trees = TreePair(self._checker.kernel, start[None], goals, self.longest, SEARCH_RESOLUTION, search.rng)
+        for _ in range(0, self.most, BATCH):
+            path = trees.grow(BATCH)
+            looked = trees.take_counts()
+            search.budget.spend(WORK, looked.proved + looked.blocked + looked.intervals)
+            if path is not None:
+                states = resample(path, STATES)
+                yield Guess(states, path[-1], least_duration(states, search.context.limits))
+                return
+            if search.budget.over():
+                return
