@@ -71,7 +71,7 @@ def parsed() -> argparse.Namespace:
 def main() -> None:
     """Make a figure, the page, or all; of all, a figure that fails does not keep the others from being made."""
     args = parsed()
-    sys.path.append(str(ROOT / "benchmarks"))  # for record
+    sys.path.append(str(ROOT))  # for benchmarks.lib.record
     make_folder(args.keep)
     make_folder(args.out)
     importlib.import_module("matplotlib.figure")  # a missing one is reported now, not after hours

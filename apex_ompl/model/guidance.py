@@ -64,7 +64,7 @@ class Guidance:
 
 EQUATION_7 = Guidance(gamma=64.0, scaling="noise", active_below=0.5)
 """Guidance as the paper has it, of the model apex-paper. The paper gives no gamma: with this one most proposals for
-validation problems are valid (benchmarks/guidance.py), without any hardly one."""
+validation problems are valid (benchmarks/model/guidance.py), without any hardly one."""
 GUIDANCES = {"clean": Guidance(), "noise": EQUATION_7}
 """What is used of each scaling."""
 

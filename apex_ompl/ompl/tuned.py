@@ -1,9 +1,9 @@
-"""Parameters tuned on the validation split: what ``python benchmarks/tune.py`` chose, benchmarks/results/tune.json.
+"""Parameters tuned on the validation split, as ``python -m benchmarks.planners.tune`` chose them.
 
 OMPL's planners keep OMPL's defaults under their names; their tuned forms are rows of the benchmarks. The planners of
-this package have the tuned values as defaults. ``roboplan`` is RoboPlan's RRT-Connect as benchmarks/peers.py runs it.
-The baselines of the paper, rrt, gpmp, gpmp2, drrt and damon, are tuned by ``python benchmarks/tune.py --baselines``, on
-easier levels.
+this package have the tuned values as defaults. ``roboplan`` is RoboPlan's RRT-Connect as benchmarks/planners/peers.py
+runs it. The baselines of the paper, rrt, gpmp, gpmp2, drrt and damon, are tuned by ``python -m benchmarks.planners.tune
+--baselines``, on easier levels.
 """
 
 from __future__ import annotations

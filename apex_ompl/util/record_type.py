@@ -13,7 +13,14 @@ if TYPE_CHECKING:
 else:
     ModelMetaclass = type(BaseModel)
 
-HIDDEN = {"model_config", "model_post_init", "model_rebuild", "model_validate", "model_validate_json"}
+HIDDEN = {
+    "model_config",
+    "model_json_schema",
+    "model_post_init",
+    "model_rebuild",
+    "model_validate",
+    "model_validate_json",
+}
 
 
 class _Text(str):

@@ -8,13 +8,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import record
-
 from apex_ompl.evaluation import Results
 from apex_ompl.evaluation.metrics import failure_ratio
 from apex_ompl.evaluation.summary import Table, about, warnings
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.statistics import share_interval
+from benchmarks.lib import record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

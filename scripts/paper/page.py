@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import record
 from paper.fid import LIMIT as FID_LIMIT
 from paper.moving import LIMIT
 from paper.published import ENTRIES, PICTURES, RIVALS, Entry, Rival, Where
@@ -19,6 +18,7 @@ from apex_ompl.model.guidance import EQUATION_7
 from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.util.files import write_atomically
+from benchmarks.lib import record
 
 MISSING, NONE = "not measured yet", ""
 PREFIX = "paper_"

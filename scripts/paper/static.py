@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import record
 from paper.figure import Made, blank, number, of_runs, ratio, ratio_cells
 from paper.rows import BOTH, PLANNERS, STATIC, TASKS, color, installed
 
@@ -18,6 +17,7 @@ from apex_ompl.evaluation.metrics import next_percentile
 from apex_ompl.evaluation.rows import jobs as jobs_of
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.evaluation.summary import Table
+from benchmarks.lib import record
 
 TIMEOUT = 10.0  # [s]
 OVER_SIZE = 7  # the first so many rows are those of the figure over size: apex, and each model guided and not

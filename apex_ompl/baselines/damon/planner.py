@@ -112,7 +112,8 @@ class DAMON(OwnPlanner):
 class DAMONParameters(Parameters):
     """DAMON (arXiv 2203.13282): A* over a graph on a learned manifold of states, reimplemented.
 
-    Manifold and number of connections are what ``python benchmarks/tune.py --baselines`` chose on the validation split.
+    Manifold and number of connections are what ``python -m benchmarks.planners.tune --baselines`` chose on the
+    validation split.
 
     Attributes:
         model: Name of a folder of the tree's ``benchmarks/baselines``, or a path; it has the dimension of the manifold.

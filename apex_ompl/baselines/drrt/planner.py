@@ -127,8 +127,8 @@ class DRRT(OwnPlanner):
 class DRRTParameters(Parameters):
     """Dynamic RRT (Ferguson, Kalra and Stentz 2006): a tree from the goal, kept between calls of ``solve``.
 
-    Range and goal bias are what ``python benchmarks/tune.py --baselines`` chose on the validation split; the share of
-    way-points, which are used from the second call of ``solve`` on, was not tuned.
+    Range and goal bias are what ``python -m benchmarks.planners.tune --baselines`` chose on the validation split; the
+    share of way-points, which are used from the second call of ``solve`` on, was not tuned.
 
     Attributes:
         range: Longest step of the tree, by the largest change of a joint.

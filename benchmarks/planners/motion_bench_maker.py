@@ -1,0 +1,203 @@
+"""VAMP and RoboPlan beside apex and rrtconnect on MotionBenchMaker's problems of Baxter with both arms at a bookshelf.
+
+The problems (Chamzas et al. 2022) are those that VAMP's source package ships, ``resources/baxter/problems.tar.bz2``
+unpacked: ``pip download --no-binary :all: --no-deps vamp-planner``. Baxter's fingers are as far open as the problems
+say. No model ships for Baxter: random bumps take the place of apex's proposals. VAMP (Thomason, Kingston and Kavraki
+2024) checks spheres and capsules of its own in single precision, and has no time limit but a number of iterations;
+RoboPlan checks the meshes. Whatever they find is looked at by the full check here, with the real meshes and the limits,
+and repaired where it fails, as rrtconnect's paths are: ``own`` is the share that a planner solves by its own check,
+``failed at first`` counts paths that failed the full one. The last line says how often VAMP's check and this one agree
+on random states near starts and goals. Each run is stored in benchmarks/runs/motion_bench_maker when it ends; the
+command resumes where it was stopped.
+
+Usage: python -m benchmarks.planners.motion_bench_maker FOLDER [-n 30] [--jobs 1]    (needs the extra "peers")
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from apex_ompl.api import load_problem
+from apex_ompl.errors import MissingFileError
+from apex_ompl.evaluation import Row, Workers, bench
+from apex_ompl.evaluation.accounting import first_path_proof
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.paths.path import path_length
+from apex_ompl.robot import load_robot
+from apex_ompl.robot.moveit import convert
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.schema import dump_yaml, read_yaml
+from apex_ompl.util.stopwatch import timed
+from apex_ompl.util.validation import one_or_more
+from benchmarks.lib import record
+from benchmarks.planners import peers
+
+try:
+    import vamp
+except ImportError as error:
+    sys.exit(f"motion_bench_maker.py: error: no VAMP ({error}), expected: pip install vamp-planner")
+
+DEPENDS = ("@benchmark", "benchmarks/planners/peers.py", "apex_ompl/goals", "apex_ompl/robot/data/baxter.robot.yaml")
+FOLDER = Path(__file__).parents[1] / "runs" / "motion_bench_maker"
+DATA = record.ROOT / "apex_ompl" / "robot" / "data"
+SETS = ("easy", "medium", "hard")
+OPEN = 0.05  # place of the fingers in the problems [m]
+RANGE, ITERATIONS = 0.5, 1_000_000  # of VAMP's RRT-Connect for Baxter, by its own package
+RUNNER = "benchmarks.planners.motion_bench_maker:plan_with_vamp"
+ROWS = (
+    Row("apex", "apex"),
+    Row("apex without proposals", "apex", {"first": 0, "second": 0, "third": 0, "resample": 0}),
+    Row("rrtconnect", "rrtconnect"),
+    Row.of("rrtconnect", TUNED["rrtconnect"]),
+    Row("rrtconnect+polish", "rrtconnect+polish"),
+    Row("roboplan", "roboplan", runner=peers.RUNNER),
+    Row.of("roboplan", TUNED["roboplan"], runner=peers.RUNNER),
+    Row("vamp", "vamp", runner=RUNNER),
+    Row.of("vamp", {"dynamic_domain": False}, runner=RUNNER),
+)
+
+
+def environment(problem: Problem) -> Any:
+    """Return VAMP's environment of a problem: boxes, and capsules around cylinders, as its own problems have them."""
+    made = vamp.Environment()
+    for body in problem.scene:
+        angles = Rotation.from_quat(body.orientation).as_euler("xyz").tolist()
+        place = list(body.position)
+        if body.box is not None:
+            made.add_cuboid(vamp.Cuboid(place, angles, [0.5 * size for size in body.box]))
+        elif body.cylinder is not None:
+            made.add_capsule(vamp.Cylinder(place, angles, body.cylinder.radius, body.cylinder.length))
+        elif body.sphere is not None:
+            made.add_sphere(vamp.Sphere(place, body.sphere.radius))
+        else:
+            raise ValueError(f"{body.name} has a shape that VAMP has not")
+    return made
+
+
+def agreement(ready: PlanningSetup, made: Any, rng: np.random.Generator) -> list[int]:
+    """Return the numbers of random states: free to both, colliding, free to VAMP alone, to the checker alone."""
+    ends, limits = np.stack([ready.start, ready.goals[0]]), ready.robot.limits
+    states = ends[rng.integers(2, size=peers.STATES)] + rng.normal(0.0, 0.3, (peers.STATES, ready.robot.dof))
+    states = np.clip(states, limits.lower, limits.upper)
+    ours, theirs = ready.checker.are_free(states), [vamp.baxter.validate(q.astype(np.float32), made) for q in states]
+    pairs = [(True, True), (False, False), (True, False), (False, True)]
+    return [sum(pair == (t, o) for t, o in zip(theirs, ours.tolist(), strict=True)) for pair in pairs]
+
+
+def plan_with_vamp(job: Job) -> Run:
+    """Return the columns of a run of VAMP; ``own`` is whether it found a path by its own check.
+
+    Parameters of the job are those of its ``RRTCSettings``, whose defaults hold otherwise.
+    """
+    problem = load_problem(job.problem)
+    ready, made = assemble(problem), environment(problem)
+    same = agreement(ready, made, np.random.default_rng(job.seed))
+    settings, rng = vamp.RRTCSettings(), vamp.baxter.halton()
+    settings.range, settings.max_iterations, settings.max_samples = RANGE, ITERATIONS, ITERATIONS
+    for name, value in job.params.items():
+        setattr(settings, name, value)
+    for _ in range(job.seed):
+        rng.next()
+    start, goal = (q.astype(np.float32) for q in (ready.start, ready.goals[0]))
+    deadline, times = Deadline(job.timeout), dict[str, float]()
+    with timed(times, "solve"):
+        found = vamp.baxter.rrtc(start, goal, made, settings, rng)
+    if not found.solved:
+        return {"solved": False, "reason": "VAMP found no path", "times": times, "own": False, "agreement": same}
+    with timed(times, "simplify"):
+        shortened = vamp.baxter.simplify(found.path, made, vamp.SimplifySettings(), rng)
+    candidates = [path.path.numpy().astype(float) for path in (shortened, found)]
+    for states in candidates:
+        states[0], states[-1] = ready.start, ready.goals[0]
+    path, reason = peers.prove(ready, candidates, deadline.at, times)
+    first = times["solve"] + first_path_proof(ready.checker, candidates[-1], ready.start, ready.goals, times)
+    return {
+        "solved": path is not None, "first": first if path is not None else None, "total": sum(times.values()),
+        "times": times, "length": None if path is None else path_length(path), "reason": reason, "own": True,
+        "agreement": same,
+    }  # fmt: skip
+
+
+def converted(folder: Path, count: int) -> list[Path]:
+    """Return problem files of the first requests of each set, which are made where they are missing."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    data, place = read_yaml(DATA / "baxter.robot.yaml", "file of a robot"), FOLDER / "baxter_open.robot.yaml"
+    for side in "lr":
+        for finger, sign in (("l", 1.0), ("r", -1.0)):
+            data["locked"][f"{side}_gripper_{finger}_finger_joint"] = sign * OPEN
+    data["covers"] = str(DATA / data["covers"])
+    write_atomically(place, dump_yaml(data).encode())
+    robot, files = load_robot(place), list[Path]()
+    for kind in SETS:
+        there = sorted(folder.rglob(f"bookshelf_tall_both_arms_{kind}_baxter/request*.yaml"))[:count]
+        if not there:
+            raise MissingFileError(
+                str(folder), "folder of problems", f"no bookshelf_tall_both_arms_{kind}_baxter in it"
+            )
+        for request in there:
+            problem = convert(request.with_name(request.name.replace("request", "scene")), request, robot).problem
+            name = f"{kind}_{request.stem.removeprefix('request')}"
+            files.append(FOLDER / f"{name}.yaml")
+            problem.model_copy(update={"name": name, "robot": str(place)}).save(files[-1])
+    return files
+
+
+def tabulate(runs: Sequence[Run]) -> tuple[dict[str, Any], str]:
+    """Return the statistics of each row on each set, and on all, and a Markdown table of them."""
+    head = ["problems", "planner", "N", "own", "solved", "failed at first", "first ms p50", "p95", "end ms p50", "p95"]
+    lines = [record.row([*head, "length rad"]), record.row(["---", "---", *["---:"] * (len(head) - 1)])]
+    found: dict[str, Any] = {}
+    for kind in (*SETS, "all"):
+        for k, row in enumerate(ROWS):
+            some = [r for r in runs if r["label"] == row.label and Path(r["problem"]).name.startswith(f"{kind}_")]
+            some = [r for r in runs if r["label"] == row.label] if kind == "all" else some
+            if not some:
+                continue
+            f = found[f"{kind}, {row.label}"] = peers.summary(some)
+            f["own"] = float(np.mean([run.get("own", run["solved"]) for run in some]))
+            times = ["-" if v is None else f"{1e3 * v:.1f}" for v in (*f["first_s"], *f["total_s"])]
+            length = "-" if f["length"] is None else f"{f['length']:.1f}"
+            shares = f"{f['own']:.2f}", f"{f['solved']:.2f}", f["failed_check"]
+            lines.append(record.row([kind if k == 0 else "", row.label, f["n"], *shares, *times, length]))
+    return found, "\n".join(lines)
+
+
+def main() -> None:
+    """Run what is missing, and write the results of all."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="the unpacked problems")
+    parser.add_argument("-n", type=one_or_more, default=30, help="problems of each set (default: %(default)s)")
+    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
+    args = parser.parse_args()
+    files = converted(args.folder, args.n)
+    results = bench(
+        [str(file) for file in files], ROWS, FOLDER / "runs", runs=1, timeout=peers.TIMEOUT,
+        workers=Workers(args.jobs, modules=("peers", "motion_bench_maker")), provenance=record.session(),
+    )  # fmt: skip
+    wanted = {str(file) for file in files}
+    found, table = tabulate([run for run in results.runs if run["problem"] in wanted])
+    same = found["all, vamp"]["agreement"]
+    words = "both free, both colliding, free to VAMP alone, free to the checker alone"
+    table += f"\n\nRandom states near starts and goals: {', '.join(map(str, same))} ({words})."
+    record.write(
+        "motion_bench_maker", {"rows": found}, table, limit=f"{peers.TIMEOUT:g} s", roboplan=version("roboplan"),
+        vamp=version("vamp-planner"), **record.made_with(results),
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    run_script(main)
