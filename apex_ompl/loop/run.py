@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -15,7 +16,7 @@ from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.environment import Environment
 from apex_ompl.loop.metrics import run_metrics
 from apex_ompl.loop.referee import judge
-from apex_ompl.loop.replan.methods import method_of
+from apex_ompl.loop.replan.methods import method_of, replanner_of
 from apex_ompl.loop.replanning import PlannerProcess, Work
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.loop.sensor import Sensor, SensorStream
@@ -73,8 +74,9 @@ def run_in(
             return run.result(done, outcome, done.ended)
         stream = SensorStream(sensor, environment, used.watched)
         if clock == "real":
+            _check_pickles(method)
             work = Work(
-                environment.problem.still, context.limits, context.stopping, used, _replanner_of, (method,), seed,
+                environment.problem.still, context.limits, context.stopping, used, replanner_of, (method,), seed,
                 rehearses=True,
             )  # fmt: skip
             with PlannerProcess(work, cores()[1]) as process:
@@ -86,9 +88,13 @@ def run_in(
     return run.judged(done)
 
 
-def _replanner_of(method: str | Replanner) -> Replanner:
-    """Return a replanner given by its name or as it is; called in the planner process."""
-    return method_of(method).make()
+def _check_pickles(method: str | Replanner) -> None:
+    try:
+        pickle.dumps(method)
+    except Exception as error:
+        raise ParameterError(
+            "method", method, f"a replanner that can be pickled to another process: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _within(limits: Limits) -> Limits:

@@ -85,7 +85,9 @@ def interval_of_proof(context: RunContext) -> float:
     for _ in range(100):
         ends = context.setup.robot.home + rng.normal(size=(2, len(context.names))) * 0.3
         ends[:, context.fingers] = 0.5
-        motion = time_path(np.clip(ends, context.limits.lower, context.limits.upper), context.limits, context.names).trajectory
+        motion = time_path(
+            np.clip(ends, context.limits.lower, context.limits.upper), context.limits, context.names
+        ).trajectory
         proof = checker.prove(curve_of(motion), tolerance=0.0)
         if proof and proof.by_spheres == 1.0:
             return seconds(lambda m=motion: checker.prove(curve_of(m), tolerance=0.0)) / proof.intervals
@@ -230,7 +232,10 @@ def trees() -> dict[str, float]:
     for name in worlds.ids("moving", "validation", 30):
         world = worlds.load(name)
         setup, present = assemble(world.problem.still), tuple(world.present(0.0))
-        context, source = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), RRTConnectFromRest()
+        context, source = (
+            RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings()),
+            RRTConnectFromRest(),
+        )
         source.prepare(context)
         dynamic, standing = DynamicObstacles(present), Following.standing(setup.start, 0.0, context.names)
         search = Search(

@@ -20,8 +20,8 @@ import json
 import math
 from typing import Any
 
+from apex_ompl import run
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
-from apex_ompl.loop.run import run
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.util.entry_point import run_script

@@ -54,11 +54,11 @@ class ReplanTimes:
             replanning.reply_of = reply_of
 
 
-def replan_times(planner: str, names: Sequence[str]) -> ReplanTimes:
+def replan_times(method: str, names: Sequence[str]) -> ReplanTimes:
     """Return what replans take in runs on the simulated clock; an untimed run before them loads all code."""
-    run(names[0], planner=planner)
+    run(names[0], method=method)
     found = ReplanTimes()
     with found.watching():
         for name in names:
-            run(name, planner=planner)
+            run(name, method=method)
     return found

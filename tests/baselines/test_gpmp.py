@@ -6,17 +6,16 @@ import itertools
 
 import numpy as np
 import pytest
-from loops import PROBLEM, go, context_of, setup_of
+from loops import PROBLEM, context_of, go, setup_of
 from ompl import base as ob
 
-from apex_ompl import MotionPlanner, plan, planners, problems
+from apex_ompl import MotionPlanner, plan, planners, problems, run
 from apex_ompl.baselines.gpmp.planner import GaussianProcessPlanner
 from apex_ompl.baselines.gpmp.replanner import IncrementalGPMP, IncrementalGPMP2
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel.clearance_costs import clearance_costs
-from apex_ompl.loop.replan.methods import METHODS
-from apex_ompl.loop.run import run
+from apex_ompl.loop.replan.methods import named
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import Following
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
@@ -238,12 +237,14 @@ def test_the_replanner_begins_as_the_robot_moves(kind: type[IncrementalGPMP2]) -
     for order in range(3):
         np.testing.assert_allclose(second.motion(0.0, order), behind[order], atol=1e-9)
     assert second.motion.duration < first.motion.duration
-    assert replanner.replan(context, Request(1, 0.0, 0.05, standing, None, dynamic, 0.0, (), np.inf, 0), ComputeBudget(0.0))
+    assert replanner.replan(
+        context, Request(1, 0.0, 0.05, standing, None, dynamic, 0.0, (), np.inf, 0), ComputeBudget(0.0)
+    )
 
 
 @pytest.mark.parametrize("name", ["gpmp", "gpmp2"])
 def test_the_loop_reaches_its_goal_with_it(name: str) -> None:
-    done, report = go(METHODS[name].make(), timeout=6.0, **METHODS[name].settings)
+    done, report = go(named(name).make(), timeout=6.0, **named(name).settings)
     assert done.reached and report.contact is None and max(report.limit_use.values()) <= 1.0 + 1e-9
     assert setup_of(PROBLEM).valid_goals.shape[1] == done.trajectory.dof
     moving = "vertical/moving-medium-0.1/800000"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from imitations import config
-from loops import PROBLEM, crossing, go, context_of, setup_of
+from loops import PROBLEM, context_of, crossing, go, setup_of
 from ompl import base as ob
 from planning import cached_problem, within
 from support import ROOT, needs
@@ -27,7 +27,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.referee import RefereeReport
-from apex_ompl.loop.replan.methods import METHODS
+from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.replanning import SHARE
 from apex_ompl.moving.compute_costs import ComputeBudget, cost_table
 from apex_ompl.moving.context import Following
@@ -230,7 +230,7 @@ def looped(model: Path, *obstacles: Obstacle, **settings: Any) -> tuple[RunRecor
 
 @pytest.fixture
 def loop_settings() -> Iterator[dict[str, Any]]:
-    yield {"timeout": 6.0, **METHODS["il"].settings}
+    yield {"timeout": 6.0, **named("il").settings}
 
 
 def test_the_loop_reaches_the_goal_where_nothing_is_in_the_way(straight: Path, loop_settings: dict[str, Any]) -> None:
@@ -253,7 +253,7 @@ def test_the_loop_follows_the_policy_unproved_into_what_it_does_not_avoid(
 
 
 def test_a_replan_begins_as_the_robot_moves_and_is_charged_by_chunks(straight: Path) -> None:
-    context = context_of(PROBLEM, **METHODS["il"].settings)
+    context = context_of(PROBLEM, **named("il").settings)
     method = Imitation(str(straight), steps=16)
     method.prepare(context)
     begin, moving = 0.0, Following.standing(context.setup.start, 0.0, context.names)

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loops import FAR, PROBLEM, ByHand, line, context_of, world_of
+from loops import FAR, PROBLEM, ByHand, context_of, line, world_of
 
+from apex_ompl import run
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.clocks import simulate
 from apex_ompl.loop.cycle import Decided, Loop, RunRecord, undo
 from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.replanning import ImmediateReplanning
 from apex_ompl.loop.result import INTERRUPTED
-from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
@@ -205,7 +205,7 @@ def test_a_sensor_that_fails_ends_the_run_at_rest_with_what_was_done_so_far(step
     assert is_at_rest(motion, motion.duration) and step * PERIOD - 1e-9 <= motion.duration < step * PERIOD + 0.6
 
 
-@pytest.mark.parametrize("where", ["advance", "observe", "step", "set_out"])
+@pytest.mark.parametrize("where", ["advance", "observe", "step", "announce_start"])
 def test_an_interrupt_stops_the_robot_and_returns_what_was_done_so_far(
     where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, line_from, context_of, setup_of
+from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, context_of, crossing, go, line, line_from, setup_of
 
+from apex_ompl import run
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.executor import Executor
 from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.replan.evasion import endangered, step_aside
-from apex_ompl.loop.replan.methods import METHODS
+from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.replanning import NOTICED, Reply
 from apex_ompl.loop.result import Event
-from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.tracking import Tracker
 from apex_ompl.moving.compute_costs import ComputeBudget
@@ -82,7 +82,7 @@ def test_the_robot_touches_nothing_while_it_moves(
 ) -> None:
     some, evade = boxes(seed, fastest), ("proved", "never")[seed // 2 % 2]
     parameters = {"prediction": prediction, "monitored": monitored, "hastens": hastens, "evade": evade}
-    replanner: Any = METHODS["no-network"].make() if seed % 2 else ByHand(line)
+    replanner: Any = named("no-network").make() if seed % 2 else ByHand(line)
     done, report = go(replanner, *some, sensor=Sensor(seed=seed), fastest=fastest, **parameters)
     assert done.broken == 0 and report.still_contact is None and done.unguarded == 0
     check_limits(report)
@@ -167,7 +167,9 @@ def test_a_step_aside_is_no_proof_of_what_the_robot_does_until_then(
             return ()
 
     monkeypatch.setattr(context, "first_conflict", first_conflict)
-    executor = Executor(context, Answered(), Tracker(context.kernel), 0, first, pending=request, conflict=now, contact=now)
+    executor = Executor(
+        context, Answered(), Tracker(context.kernel), 0, first, pending=request, conflict=now, contact=now
+    )
     before = executor.stop = Following(first.motion.after(now), now) if moves else None
     executor._answer(now, empty, empty)
     assert executor.following is not first and executor.aside is executor.following

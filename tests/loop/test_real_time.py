@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 from faulty_replanners import Faulty
-from loops import BLOCKED, PROBLEM, crossing, context_of, setup_of, world_of
+from loops import BLOCKED, PROBLEM, context_of, crossing, setup_of, world_of
 
+from apex_ompl import run
 from apex_ompl.errors import PlannerProcessError
-from apex_ompl.loop import replanning as planner_process
+from apex_ompl.loop import replanning
 from apex_ompl.loop.clocks import run_in_real_time
 from apex_ompl.loop.cycle import Loop, RunRecord
 from apex_ompl.loop.environment import Observation
@@ -27,7 +28,6 @@ from apex_ompl.loop.referee import RefereeReport, judge
 from apex_ompl.loop.replan.methods import replanner_of
 from apex_ompl.loop.replanning import PlannerProcess, Work, reply_of
 from apex_ompl.loop.result import INTERRUPTED, Outcome, RunResult
-from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import Following, RunContext
@@ -102,7 +102,7 @@ def test_observations_may_be_late_doubled_out_of_order_or_no_numbers() -> None:
     check_defined(*go(eyes=BadEyes))
 
 
-@pytest.mark.parametrize("where", ["advance", "step", "set_out"])
+@pytest.mark.parametrize("where", ["advance", "step", "announce_start"])
 def test_an_interrupt_stops_the_robot(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     original, left = getattr(Loop, where), [1]
 
@@ -199,9 +199,11 @@ def test_what_is_sent_late_goes_to_no_other_process(monkeypatch: pytest.MonkeyPa
             os.write(number, b"stale")
         sent.append(message)
 
-    monkeypatch.setattr(planner_process, "_sent", slow)
+    monkeypatch.setattr(replanning, "_sent", slow)
     context, world = context_of(PROBLEM), world_of(PROBLEM)
-    process = PlannerProcess(Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, (), 0))
+    process = PlannerProcess(
+        Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, (), 0)
+    )
     process.close()
     assert sent and process.process.poll() is not None
     mine, other = multiprocessing.Pipe()

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from loops import BLOCKED, FAR, PROBLEM, line_from, context_of
+from loops import BLOCKED, FAR, PROBLEM, context_of, line_from
 
 from apex_ompl.loop.replan import evasion
 from apex_ompl.loop.replan.evasion import wait_nearer
@@ -36,7 +36,11 @@ def palm(context: RunContext, q: np.ndarray) -> np.ndarray:
 
 
 def search_of(
-    context: RunContext, *obstacles: Obstacle, at: np.ndarray | None = None, conflict: float = np.inf, budget: float = 0.05
+    context: RunContext,
+    *obstacles: Obstacle,
+    at: np.ndarray | None = None,
+    conflict: float = np.inf,
+    budget: float = 0.05,
 ) -> Search:
     """A replan of a robot that stands, at the start unless elsewhere, and for which none was found before."""
     standing = Following.standing(context.setup.start if at is None else at, 0.0, context.names)

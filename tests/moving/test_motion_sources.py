@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from loops import FAR, PROBLEM, line_from, context_of
+from loops import FAR, PROBLEM, context_of, line_from
 
 from apex_ompl.loop.replan.portfolio import faster_motions
 from apex_ompl.loop.replan.sources import Renoised

@@ -16,7 +16,7 @@ SOURCES = ("api.py", "loop/run.py", "planning/one_plan.py", "planning/planner.py
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
 USE = """
 from apex_ompl.api import plan
-from apex_ompl.loop.run import run
+from apex_ompl import run
 from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.planning.planner import MotionPlanner
 

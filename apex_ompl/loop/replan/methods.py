@@ -52,6 +52,16 @@ def method_of(method: str | Replanner) -> Method:
     return Method(type(method).__name__, lambda: method)
 
 
+def replanner_of(method: str | Replanner) -> Replanner:
+    """Return a new replanner of that name, or the given one.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        ParameterError: It is neither a name nor a replanner.
+    """
+    return method_of(method).make()
+
+
 def _load_baselines() -> None:
     for module in BASELINES:
         import_module(f"apex_ompl.baselines.{module}")
