@@ -1,4 +1,7 @@
-"""The simulated clock: steps at its period, whatever they take, with work that is charged by counts."""
+"""The two clocks of a run: the simulated one, on which work takes modeled costs, and the wall clock.
+
+On the wall clock a step is decided while the one before is executed; one that is late is a proved stop.
+"""
 
 from __future__ import annotations
 
@@ -30,14 +33,14 @@ from apex_ompl.util.exiting import running
 def simulate(
     environment: Environment, context: RunContext, replanner: Replanner, sensor: ObservationSource, seed: int
 ) -> RunRecord:
-    """Run the loop in a world until the robot stands at a goal, or time is up.
+    """Run the loop on the simulated clock until the robot is at rest at a goal, or the time is up.
 
     Args:
-        world: What truly happens.
-        context: The robot among what stands still.
-        replanner: How motions are planned anew.
-        eyes: What observes the world.
-        seed: Of random choices.
+        environment: What truly happens.
+        context: The robot among static obstacles, and the settings of the run.
+        replanner: Plans motions.
+        sensor: Observes the environment.
+        seed: Seed of random choices.
     """
     loop = Loop(environment, context, ImmediateReplanning(context, replanner), sensor, seed)
     with running(loop.abort):
@@ -63,7 +66,7 @@ def cores() -> tuple[int | None, int | None]:
 
 @contextmanager
 def undisturbed(core: int | None) -> Iterator[None]:
-    """While the block runs, keep this thread to a core, and let no garbage be collected."""
+    """While the block runs, pin this thread to a core, and disable garbage collection."""
     enabled, before = gc.isenabled(), os.sched_getaffinity(0) if core is not None else None
     gc.collect()
     gc.freeze()
@@ -81,7 +84,7 @@ def undisturbed(core: int | None) -> Iterator[None]:
 
 
 def warm_up(context: RunContext, environment: Environment, seed: int) -> None:
-    """Do once what a step does, so that compiled functions are loaded before the clock runs."""
+    """Call once what a step calls, so that compiled functions are loaded before the clock runs."""
     present = tuple(environment.present(0.0)) or (
         Obstacle(name="warm-up", box=(0.1, 0.1, 0.1), position=(9.0, 9.0, 9.0)),
     )
@@ -90,7 +93,7 @@ def warm_up(context: RunContext, environment: Environment, seed: int) -> None:
     motion = time_path(np.stack([context.setup.start, context.goals[0]]), context.limits, context.names).trajectory
     line = Following(motion, 0.0, to_goal=True)
     predicted, half = tracker.predicted(context.settings.margin), 0.5 * motion.duration
-    tracker.eased(predicted, context.setup.start, [0.0])
+    tracker.ease_margins(predicted, context.setup.start, [0.0])
     context.first_conflict(predicted, line, 0.0, line.end)
     context.proved_stop(tracker.reachable(0.0, 0.0), line, half, half + context.settings.period)
     context.clear_of_static(motion)
@@ -101,23 +104,23 @@ def warm_up(context: RunContext, environment: Environment, seed: int) -> None:
 def run_in_real_time(
     environment: Environment, context: RunContext, planner: PlannerProcess, sensor: ObservationSource, seed: int
 ) -> RunRecord:
-    """Run the loop by the clock on the wall until the robot stands at a goal, or time is up.
+    """Run the loop by the wall clock until the robot is at rest at a goal, or the time is up.
 
-    The step at a time is decided in the period before it, by what was seen until that began. What a driver has is the
-    motion until the next step and a proved stop behind it; so where a step was not decided in time, the robot follows
-    that stop, and what the step had decided is undone. The clock stands while the world answers to the first motion.
+    A step is decided in the period before it, by the observations before that period. A driver holds the motion until
+    the next step and the proved stop after it. So where a step was not decided in time, the robot follows that stop, and
+    the decision is undone. The clock is paused while the environment reacts to the first motion.
 
     Args:
-        world: What truly happens.
-        context: The robot among what stands still.
-        planner: The process that makes replans, which is ready.
-        eyes: What observes the world.
-        seed: Of random choices.
+        environment: What truly happens.
+        context: The robot among static obstacles, and the settings of the run.
+        planner: The planner process, which is ready.
+        sensor: Observes the environment.
+        seed: Seed of random choices.
 
     Returns:
-        What came of it; ``measured`` has ``tick_p50``, ``tick_p99`` and ``tick_worst``, times that a step took to be
-        decided [s], without those for which the world and its sensor were simulated, and ``deadline_misses``, the
-        number of steps that were not decided in time.
+        The record of the run. ``measured`` has ``tick_p50``, ``tick_p99`` and ``tick_worst``, computing times of a step
+        [s] without the simulation of environment and sensor, and ``deadline_misses``, the number of steps that were not
+        decided in time.
     """
     period = context.settings.period
     loop = Loop(environment, context, planner, sensor, seed, lead=period)
@@ -126,15 +129,15 @@ def run_in_real_time(
     ended: RunRecord | None = None
     warm_up(context, environment, seed)
     with undisturbed(cores()[0]), running(loop.abort):
-        began = time.perf_counter()
+        started = time.perf_counter()
         while ended is None:
             before, then = Decided.of(executor), (k + 1) * period
             try:
-                wait = began + k * period - time.perf_counter()
+                wait = started + k * period - time.perf_counter()
                 if wait > 0.0:
                     time.sleep(wait)
-                seen = time.perf_counter() - began
-                if math.floor(seen / period) > k:  # periods went by without a step
+                seen = time.perf_counter() - started
+                if math.floor(seen / period) > k:  # periods passed without a step
                     undo(executor, then, before)
                     missed += math.floor(seen / period) - k
                     k = math.floor(seen / period)
@@ -145,12 +148,12 @@ def run_in_real_time(
                 ended = loop.step(then)
                 ticks.append(time.perf_counter() - looked)
                 k += 1
-                if ended is None and time.perf_counter() - began > then:
+                if ended is None and time.perf_counter() - started > then:
                     undo(executor, then, before)
                     missed += 1
                 paused = time.perf_counter()
                 loop.announce_start(then)
-                began += time.perf_counter() - paused
+                started += time.perf_counter() - paused
             except KeyboardInterrupt:
                 ended, k = None, round(then / period)
                 loop.interrupt(then, before)

@@ -1,12 +1,12 @@
-"""The executor: what the robot follows, and the proved stop that is always in hand.
+"""The executor: what the robot follows, and the safety filter that keeps a fail-safe stop at every step.
 
-At every step the robot goes on only where the next step and a stop behind it are proved clear of all that obstacles of
-bounded speed can reach; else it follows the stop that was proved a step before. By induction it is at rest whenever it
-is touched, as long as no obstacle is faster than was assumed, and each was seen, within the error assumed, not longer
-ago than what was known when the stop was proved. A robot at rest that is about to be touched may step aside along a
-motion that is proved like that until it is at rest again, which then is the fail-safe stop itself. Only where the user
-chooses so (``evade="risk"``) it leaves without; the steps at which it moves without a fail-safe stop are counted. (A
-fail-safe maneuver that is verified online, Althoff and Dolan 2014; Pereira and Althoff 2015.)
+At every step the robot continues only where the next step and a stop after it are proved clear of the reachable sets of
+all obstacles; else it follows the stop that was proved one step before. By induction it is at rest whenever it is
+touched, as long as no obstacle is faster than assumed, and each was seen, within the assumed error, before the stop was
+proved. A robot at rest that is about to be touched may step aside along a motion that is proved in the same way until it
+is at rest again; that motion then is the fail-safe stop itself. Only where the user chooses so (``evade="risk"``) it
+leaves without a fail-safe stop; those steps are counted. (Fail-safe maneuvers verified online: Althoff and Dolan 2014;
+Pereira and Althoff 2015.)
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from apex_ompl.moving.search import EARLIER
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
 
-BLIND_TIME = 0.15  # for which an obstacle may go anywhere before the robot stands [s]
-SHORTEST = 0.1  # rest of a motion for which no faster one is looked for [s]
-NEAR = 0.5  # time before a conflict from which on the robot brakes where no answer comes at once [s]
-NEARER = 0.01  # by which an obstacle must come nearer than where a motion began, within the trigger, to stop it [m]
+BLIND_TIME = 0.15  # time that an obstacle may move unseen before the robot is at rest [s]
+SHORTEST = 0.1  # remaining time of a motion below which no faster one is sought [s]
+NEAR = 0.5  # time before a conflict below which the robot brakes where no answer comes at once [s]
+NEARER = 0.01  # by how much nearer than at the start of a motion an obstacle must come, within the trigger, to stop it [m]
 
 
 @dataclass(eq=False)
@@ -40,33 +40,33 @@ class Executor:
     """One run's executor.
 
     Attributes:
-        context: The robot among what stands still.
-        replanning: Who plans motions anew.
-        tracker: What is known of the obstacles.
-        seed: Of random choices.
-        following: What the robot follows.
-        stop: The fail-safe stop: what is proved from the next step on until the robot is at rest, or from now on where
-            it is what the robot follows; None where it is at rest, or leaves without.
-        followed: What was followed from which times on.
+        context: The robot among static obstacles, and the settings of the run.
+        replanning: Answers requests for replans.
+        tracker: Estimates of the obstacles.
+        seed: Seed of random choices.
+        following: The motion that the robot follows.
+        stop: The fail-safe stop: it is proved from the next step on until the robot is at rest, or from now on where the
+            robot follows it; None for a robot at rest, or one that leaves without.
+        followed: The motions that were followed, and from which times on.
         events: What happened.
         route: The last motion to a goal, or None.
-        pending: What was asked for and is not answered yet, or None.
+        pending: The request that is not answered yet, or None.
         asked: Number of replans so far.
-        conflict: Time of the first conflict of what is followed [s], or infinity.
-        contact: The same without margins for what is uncertain, where the robot will be at rest soon; else infinity.
+        conflict: Time of the first predicted conflict of the motion [s], or infinity.
+        contact: The same without margins for uncertainty, where the robot will be at rest soon; else infinity.
         unguarded: Number of steps at which the robot moved without a fail-safe stop.
-        conflict_since: Since when a conflict is known that the command does not answer yet [s], or None.
-        nearest: Distance of an obstacle below which the motion counts as blocked, where that goes by distance [m].
-        closed: Whether the time is up: no motion is asked for or taken any more.
+        conflict_since: Time of the first prediction of a conflict to which the command has not changed yet [s], or None.
+        nearest: Distance of an obstacle below which the motion counts as blocked, where distance decides [m].
+        closed: Whether the time is up: no motion is requested or taken any more.
         ending: Whether the robot follows the stop that ends the run.
-        leaving: Whether the robot leaves a place that an obstacle comes to, and goes on without a proved stop.
+        leaving: Whether the robot leaves a place that an obstacle comes to, without a fail-safe stop.
         aside: The last step aside that was followed, or None.
-        departure: When it does [s].
-        lead: How long before a step it is decided, by what was seen until then [s].
-        ahead: How long before the conflict that was [s].
-        doing: What the robot did then: it was ``going``, ``braking`` already, or ``standing``.
+        departure: When the last answer starts [s].
+        lead: How long before a step it is decided, by the observations until then [s].
+        ahead: Time from the first prediction of the conflict to the conflict [s].
+        doing: What the robot did at that prediction: ``going``, ``braking`` or ``standing``.
         braking: The stop that was followed last, or None.
-        hastened: When a faster motion was asked for last [s].
+        hastened: When a faster motion was requested last [s].
     """
 
     context: RunContext
@@ -97,7 +97,7 @@ class Executor:
     hastened: float = -math.inf
 
     def log(self, time: float, kind: str, **data: Any) -> None:
-        """Note an event."""
+        """Record an event."""
         self.events.append(Event(time, kind, data))
 
     def follow(self, one: Following, time: float) -> None:
@@ -109,9 +109,9 @@ class Executor:
         """Decide what the robot does until the next step.
 
         Args:
-            now: Time of the clock [s].
-            predicted: The obstacles as they are expected to move.
-            obstacles: Returns their records where they are now, with velocities; called where a replan is asked for.
+            now: Clock time [s].
+            predicted: The predicted obstacles.
+            obstacles: Returns their records at their places now, with velocities; called where a replan is requested.
         """
         settings = self.context.settings
         reachable = self.tracker.reachable(*settings.assumed, q=self.state(now)) if settings.guarded else None
@@ -135,21 +135,21 @@ class Executor:
         return self.following.at(now).moves or self.following.at(now + self.context.settings.period).moves
 
     def close(self, now: float) -> None:
-        """Come to rest, since the time is up: follow the stop in hand. To be called before each step from then on.
+        """Come to rest since the time is up, by the fail-safe stop; to be called before each further step.
 
         Args:
-            now: Time of the clock [s].
+            now: Clock time [s].
         """
         self.closed, self.pending = True, None
         stop = None if self.ending or self.following.at_rest(now) else self._stop_at(now)
-        if stop is None:  # where there is none in hand yet, there may be one at the next step
+        if stop is None:  # there may be one at the next step
             return
         self.ending = True
         if stop is not self.following:
             self._follow_stop(now, stop)
 
     def _look(self, now: float, predicted: DynamicObstacles) -> None:
-        """Find the first conflict of what is followed."""
+        """Find the first predicted conflict of the motion."""
         if self.context.settings.by_distance:
             found = now if self._distance(now, predicted) < self.nearest else math.inf
         else:
@@ -164,21 +164,20 @@ class Executor:
             self.contact = self._first_conflict(self.following, now, predicted.nominal(self.context.settings.margin))
 
     def _doing(self, now: float) -> str:
-        """Return whether the robot is going, braking, or standing."""
+        """Return what the robot does: ``going``, ``braking`` or ``standing``."""
         if not self.following.at(now).moves:
             return STANDING
         return BRAKING if self.following is self.braking else GOING
 
     def _distance(self, now: float, predicted: DynamicObstacles) -> float:
-        """Return how far obstacles are from the robot, at most twice the trigger [m]."""
-        looked = np.array([now])
+        """Return the distance of obstacles from the robot, at most twice the trigger [m]."""
         clear, _ = clearance_in_time(
-            self.context.kernel, predicted, self.state(now)[None], looked, 2.0 * self.context.settings.trigger
+            self.context.kernel, predicted, self.state(now)[None], np.array([now]), 2.0 * self.context.settings.trigger
         )
         return float(clear.min())
 
     def _brake(self, now: float, predicted: DynamicObstacles) -> None:
-        """Stop where a conflict is near and no answer came within a step, if it is not touched as soon there.
+        """Stop where a conflict is near and no answer came within a step, unless the robot would be touched as soon.
 
         A robot that leaves without a fail-safe stop does not wait for an answer.
         """
@@ -192,16 +191,16 @@ class Executor:
             self._follow_stop(now, stop)
 
     def _first_conflict(self, one: Following, now: float, predicted: DynamicObstacles) -> float:
-        """Return the time of the first conflict of a motion, or of standing where it ends [s], or infinity."""
+        """Return the time of the first predicted conflict of a motion, or of rest at its end [s], or infinity."""
         hold = self.context.settings.hold if one.to_goal else self.context.settings.rest_hold
         return self.context.first_conflict(predicted, one, now, max(one.end, now) + hold)
 
     def blind(self, now: float) -> bool:
-        """Whether there was no look of use for too long."""
+        """Whether there was no usable observation for too long."""
         return now - self.tracker.last > self.context.settings.silence
 
     def _stop_blind(self, now: float) -> None:
-        """Stop, since there was no look of use for too long."""
+        """Stop since there was no usable observation for too long."""
         if self.following.at_rest(now):
             return
         stop = self._stop_at(now)
@@ -218,7 +217,7 @@ class Executor:
             self._follow_stop(now, stop)
 
     def _stop_at(self, now: float) -> Following | None:
-        """Return the stop in hand, or one that is not proved where none is wanted; None where there is none."""
+        """Return the fail-safe stop, or an unproved one where the settings ask for none; None where there is none."""
         return self.stop if self.context.settings.guarded else self.context.unproved_stop(self.following, now)
 
     def _follow_stop(self, now: float, stop: Following) -> None:
@@ -229,12 +228,12 @@ class Executor:
 
     @property
     def _patience(self) -> float:
-        """Time behind which a motion was to begin for which its answer is waited for [s]."""
+        """Time for which an answer is awaited after its motion was to start [s]."""
         settings = self.context.settings
         return settings.stuck if settings.from_rest else settings.period
 
     def _guard(self, now: float, reachable: DynamicObstacles, predicted: DynamicObstacles) -> None:
-        """Go on with a proved stop behind the next step, or stop."""
+        """Continue with a proved stop after the next step, or stop."""
         if self.following.at_rest(now):
             self.leaving = False
         elif self.stop is self.following:
@@ -245,36 +244,36 @@ class Executor:
         then = now + self.context.settings.period
         found = self.context.proved_stop(reachable, self.following, now, then)
         if found is not None:
-            if self.leaving:  # a stop in place is not what it leaves for, nor one where it would be touched as well
+            if self.leaving:  # a stop in place is no way out, nor is one where it would be touched as well
                 waits = now <= self.departure or not self.following.at(now).velocity.any()
                 self.leaving = waits or self._first_conflict(found, now, predicted) < now + NEAR
             self.stop = found
             return
         if self.leaving or self.following.at_rest(now):
             self.stop = None
-        elif not self.following.at(now).moves:  # it did not set out yet
+        elif not self.following.at(now).moves:  # it has not started yet
             self.stop = None
             self.follow(Following.standing(self.state(now), now, self.context.names), now)
             self.log(now, "stop", at=now)
         elif self.stop is None:
-            self.log(now, "broken assumption", what="no stop is in hand")
+            self.log(now, "broken assumption", what="there is no fail-safe stop")
         elif self.stop is not self.following:
             self._follow_stop(now, self.stop)
 
     def _proved_to_rest(self, now: float, reachable: DynamicObstacles) -> bool:
-        """Whether all that the robot follows is proved until it is at rest, from when it moves on."""
+        """Whether the whole motion is proved until the robot is at rest, from the time at which it moves."""
         start = now if self.following.at(now).moves else max(now, self.departure)
         return math.isinf(self.context.first_conflict(reachable, self.following, start, self.following.end))
 
     def _answered(self, now: float, how: str) -> None:
-        """Note how long after a conflict was known the command changed."""
+        """Record how long after the first prediction of a conflict the command changed."""
         if self.conflict_since is not None:
             took = now - self.conflict_since + self.lead
             self.log(now, "reaction", seconds=took, how=how, ahead=self.ahead, doing=self.doing)
             self.conflict_since = None
 
     def _answer(self, now: float, predicted: DynamicObstacles, reachable: DynamicObstacles | None) -> None:
-        """Take the answer of a replan that is known by now, where it is of use."""
+        """Take the answer of a replan that is available now, where it is useful."""
         reply, request = self.replanning.reply(now), self.pending
         faults = self.replanning.faults()
         for fault in faults:
@@ -301,9 +300,9 @@ class Executor:
             aside, then = self._may_leave(now, found), found.start_time + self.context.settings.period
             proved = aside and self.context.proved_to_rest(reachable, found)
             risk = self.context.settings.evade == "risk" and self.following.at_rest(found.start_time)
-            leaving = risk and aside and not proved  # a stop at once is no way to leave
+            leaving = risk and aside and not proved  # a stop at once is no way out
             if not (proved or leaving) and self.context.proved_stop(reachable, found, found.start_time, then) is None:
-                why = "no stop behind its first step is proved"
+                why = "no stop after its first step is proved"
         if why:
             self.log(now, request.refused, why=why, **took)
             return
@@ -322,7 +321,7 @@ class Executor:
     def _at_once(
         self, now: float, request: Request, found: Following, predicted: DynamicObstacles
     ) -> tuple[Request, Following]:
-        """Return a request and its answer, which begins now where a robot that stands can set out at once."""
+        """Return a request and its answer; the answer starts now where the robot is at rest and can start at once."""
         if request.following is not self.following or abs(found.start_time - request.join) > SAME_TIME:
             return request, found
         earlier = replace(request, join=now), replace(found, start_time=now)
@@ -334,10 +333,10 @@ class Executor:
         return request, found
 
     def _fault(self, now: float, request: Request, found: Following, predicted: DynamicObstacles) -> str:
-        """Return why an answer is of no use any more, or nothing."""
+        """Return why an answer is not useful any more, or nothing."""
         settings = self.context.settings
         if request.following is not self.following:
-            return "the robot follows another motion by now"
+            return "the robot follows another motion now"
         if self.leaving and found.to_goal and not self.following.at_rest(now):
             return "the robot leaves without a fail-safe stop"
         if now > request.join + 1e-9:
@@ -351,11 +350,11 @@ class Executor:
         conflict = self._first_conflict(found, found.start_time, predicted)
         gains = self._may_leave(now, found) and conflict > self.conflict + GAIN
         if math.isfinite(conflict) and not gains:
-            return "what was seen since then is in the way"
+            return "an obstacle seen since the request is in the way"
         return ""
 
     def _may_leave(self, now: float, found: Following) -> bool:
-        """Whether the robot may step aside along a motion, since what comes would touch it where it is, or goes."""
+        """Whether the robot may step aside along a motion, since an obstacle would soon touch it otherwise."""
         if found.to_goal or self.context.settings.evade == "never":
             return False
         return (self.contact if self.following.at_rest(found.start_time) else self.conflict) < now + SOON
@@ -367,9 +366,9 @@ class Executor:
         reachable: DynamicObstacles | None,
         obstacles: Callable[[], tuple[Obstacle, ...]],
     ) -> None:
-        """Ask for a replan where one is of use."""
+        """Request a replan where one is useful."""
         settings = self.context.settings
-        self._give_up(now)
+        self._cancel(now)
         if self.pending is not None or not self._wants(now):
             return
         join = now + settings.budget
@@ -377,29 +376,29 @@ class Executor:
         error, fastest = settings.assumed
         clearance_margin = max(settings.clearance_margin, error + BLIND_TIME * fastest)
         request = Request(
-            self.asked, now, join, self.following, self.route, predicted, clearance_margin, obstacles(), self.conflict, self.seed,
-            contact=self.contact, reachable=reachable,
+            self.asked, now, join, self.following, self.route, predicted, clearance_margin, obstacles(), self.conflict,
+            self.seed, contact=self.contact, reachable=reachable,
             leaving=(self.leaving or self.following is self.aside) and not self.following.at_rest(join),
         )  # fmt: skip
         if self.replanning.submit(request):
             self.log(now, "improve" if request.hastens else "request", number=self.asked, join=join)
             self.pending, self.hastened = request, now if request.hastens else self.hastened
 
-    def _give_up(self, now: float) -> None:
-        """Give up a request that knows nothing of what is in the way by now.
+    def _cancel(self, now: float) -> None:
+        """Cancel a request that was made before a conflict was predicted.
 
-        It is one for a faster motion, or one of a robot that is about to be touched where it stands, so that it steps
-        aside at once.
+        It is one for a faster motion, or one of a robot that is about to be touched at rest, so that it steps aside at
+        once.
         """
         settings, request = self.context.settings, self.pending
         if request is None or settings.from_rest or math.isfinite(request.conflict):
             return
-        if not (settings.guarded or settings.hastens):  # a reflex, or one plan that is followed blindly
+        if not (settings.guarded or settings.hastens):  # a reflex, or one plan that is followed to the end
             return
         if settings.evade == "never" and not request.hastens:
             return
         if request.hastens and math.isfinite(self.conflict):
-            self.log(now, request.refused, why="something is in the way", number=request.number, part="")
+            self.log(now, request.refused, why="an obstacle is in the way", number=request.number, part="")
             self.pending = None
         elif endangered(self.following, now + settings.budget, self.contact, URGENT):
             self.log(now, request.refused, why="an obstacle comes", number=request.number, part="")
@@ -423,7 +422,7 @@ class Executor:
         return now >= self.hastened + settings.budget - SAME_TIME
 
     def done(self, now: float) -> bool:
-        """Whether the robot stands at a goal."""
+        """Whether the robot is at rest at a goal."""
         return self.following.to_goal and self.following.at_rest(now)
 
     def state(self, now: float) -> Array:

@@ -48,7 +48,7 @@ def run_metrics(
         trajectory: The executed motion from time 0 on.
         events: What happened.
         limits: Those of the robot.
-        clearance: Least distance to obstacles that move [m]; infinite without one.
+        clearance: Least distance to dynamic obstacles [m]; infinite without one.
 
     Raises:
         ParameterError: A ``reaction`` event without a number of seconds, or the limits are those of other joints.

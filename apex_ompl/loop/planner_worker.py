@@ -24,13 +24,13 @@ from apex_ompl.timing import time_path
 from apex_ompl.util.threads import one_torch_thread
 
 RADIUS, VELOCITY = 0.06, (0.02, 0.0, 0.0)  # of the obstacle in the way [m, m/s]
-LONG = 1.0  # that a rehearsed replan may take by the table of costs [s]
+LONG = 1.0  # time that a rehearsed replan may take by the compute-cost table [s]
 
 
 def requests(context: RunContext) -> tuple[Request, ...]:
-    """Return requests of all sorts among an obstacle in the middle of the straight line to the first goal.
+    """Return requests of all kinds with an obstacle in the middle of the straight line to the first goal.
 
-    The robot stands; stands where it is about to be touched; moves towards the obstacle; and is to be made faster.
+    The robot is at rest; is at rest and about to be touched; moves towards the obstacle; and asks for a faster motion.
     """
     start, goal, settings = context.setup.start, context.goals[0], context.settings
     standing = Following.standing(start, 0.0, context.names)
@@ -50,7 +50,7 @@ def requests(context: RunContext) -> tuple[Request, ...]:
 
 
 def rehearse(replanner: Replanner, context: RunContext) -> None:
-    """Let a way of replanning that is prepared answer requests of all sorts, and prepare it anew."""
+    """Let a prepared replanner answer requests of all kinds, so that all code is loaded, and prepare it again."""
     if not len(context.goals):
         return
     for request in requests(context):

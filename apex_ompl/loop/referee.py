@@ -67,12 +67,12 @@ class RefereeReport:
     """What the referee found.
 
     Attributes:
-        contact: First contact with an obstacle that moves, or None.
+        contact: First contact with an dynamic obstacle, or None.
         moving_contact: First contact with one while the robot moved, which may be the same, or None.
-        still_contact: First contact with what stands still or of the robot with itself, or None.
+        still_contact: First contact with static obstacles or of the robot with itself, or None.
         limit_use: Largest share of each limit that the motion uses, by ``position``, ``velocity``, ``acceleration`` and
             ``jerk``.
-        clearance: Lower bound of the least distance to obstacles that move, over all samples, by the sphere cover
+        clearance: Lower bound of the least distance to dynamic obstacles, over all samples, by the sphere cover
             [m]: it is negative where only the spheres touch, and infinite where there is no such obstacle.
         clearance_time: When that is [s], NaN without one.
         at_rest: Whether the motion ends at rest.
@@ -130,8 +130,8 @@ def judge(
 
     Args:
         robot: The robot.
-        problem: The problem, with the scripts of the obstacles that moved.
-        trajectory: The executed motion from time 0 on; behind its end the robot stands.
+        problem: The problem, with the scripts of the moving obstacles.
+        trajectory: The executed motion from time 0 on; after its end the robot stands.
         end: When the run ended [s], by default with the motion.
         goals: States of which the motion is to end in one, shape (N, dof); by default the goal of the problem.
         limits: Limits that are to be kept, by default the robot's.
@@ -170,7 +170,7 @@ def judge(
 
 
 class ExactDynamicObstacles:
-    """The exact shapes of a robot, of what it holds and of obstacles that move."""
+    """The exact shapes of a robot, of what it holds and of dynamic obstacles."""
 
     def __init__(self, robot: Robot, problem: Problem, scripted: ScriptedDynamicObstacles) -> None:
         """Take the robot, the problem for what is held and may touch, and the obstacles."""
@@ -251,7 +251,7 @@ def still_contact(checker: CollisionChecker, motion: Trajectory, times: Array) -
     The motion is proved along its cubic pieces; only where that fails the first sample in contact is looked for.
 
     Args:
-        checker: The robot among what stands still.
+        checker: The robot among static obstacles.
         motion: The motion.
         times: Times of the samples, shape (N,), increasing [s].
     """

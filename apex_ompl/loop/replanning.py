@@ -1,4 +1,4 @@
-"""How the executor has its replans made: at once on a simulated clock, or elsewhere on a real one."""
+"""Who answers the executor's requests: a replanner at once on the simulated clock, or a planner process in real time."""
 
 from __future__ import annotations
 
@@ -24,17 +24,22 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.interpreter import this_python
 
-SHARE = 0.85  # of the budget after which nothing new is begun
-NOTICED = 0.003  # time after which a replan that another one has overtaken ends [s]
+SHARE = 0.85  # of the budget after which nothing new is started
+NOTICED = 0.003  # time after which a superseded replan ends [s]
+STARTED = 120.0  # time that the planner process may take to become ready [s]
+SENT = 2  # largest number of unanswered requests
+HUNG = 10.0  # time without an answer after which the process is restarted [s]
+WRITTEN = 1e-3  # time to wait for the last request to be written [s]
+ENDED = 2.0  # time that the process may take to end [s]
 
 
 @dataclass(frozen=True, eq=False)
 class Reply:
-    """What came of a request.
+    """The reply to a request.
 
     Attributes:
-        number: Of the request.
-        answer: What was found.
+        number: Number of the request.
+        answer: The replanner's answer.
         failed: Why nothing was found.
     """
 
@@ -44,36 +49,36 @@ class Reply:
 
 
 def reply_of(replanner: Replanner, context: RunContext, request: Request, budget: ComputeBudget) -> Reply:
-    """Return what a way of replanning answers; whatever it raises is a reason."""
+    """Return the reply of a replanner; an exception becomes the reason why nothing was found."""
     try:
         answer: Any = replanner.replan(context, request, budget)
         if not isinstance(answer, Answer) or not isinstance(answer.found, Following | None):
             raise TypeError(f"{type(getattr(answer, 'found', answer)).__name__} is no answer")
-    except Exception as error:  # whatever a way of replanning does, the robot goes on or stops
+    except Exception as error:  # whatever a replanner raises, the robot continues or stops
         return Reply(request.number, Answer(None, "", budget), f"{type(error).__name__}: {error}")
     return Reply(request.number, answer)
 
 
 class Replanning(Protocol):
-    """Who makes replans."""
+    """Answers requests for replans."""
 
     def submit(self, request: Request) -> bool:
-        """Begin a replan, and return whether it was; what was asked for before is of no use any more."""
+        """Start a replan, and return whether it was started; it supersedes earlier requests."""
 
     def reply(self, now: float) -> Reply | None:
-        """Return what is known by a time of the clock [s], once."""
+        """Return the reply that is available at a clock time [s], once."""
 
     def faults(self) -> tuple[str, ...]:
-        """Return what went wrong since the last call, each in a few words."""
+        """Return the faults since the last call, each in a few words."""
 
 
 @dataclass(eq=False)
 class ImmediateReplanning:
-    """Replans made when they are asked for, whose answers are known when the work would be done by the table of costs.
+    """Replans at once; a reply is available when the work would be done by the compute-cost model.
 
     Attributes:
-        context: The robot among what stands still.
-        replanner: The way of replanning.
+        context: The robot among static obstacles, and the settings of the run.
+        replanner: The replanner.
     """
 
     context: RunContext
@@ -82,7 +87,7 @@ class ImmediateReplanning:
     _reply: Reply | None = None
 
     def submit(self, request: Request) -> bool:
-        """Make a replan."""
+        """Replan."""
         settings = self.context.settings
         busy = self._reply is not None and request.asked < self._known - 1e-9
         budget = ComputeBudget(SHARE * settings.budget, NOTICED if busy else 0.0)
@@ -91,37 +96,31 @@ class ImmediateReplanning:
         return True
 
     def reply(self, now: float) -> Reply | None:
-        """Return the answer when it is known."""
+        """Return the reply when it is available."""
         if self._reply is None or now < self._known - 1e-9:
             return None
         reply, self._reply = self._reply, None
         return reply
 
     def faults(self) -> tuple[str, ...]:
-        """Nothing goes wrong."""
+        """There are none."""
         return ()
 
-
-STARTED = 120.0  # time that the process has to make itself ready [s]
-SENT = 2  # requests at most that are not answered yet
-HUNG = 10.0  # time without an answer after which the process is made anew [s]
-WRITTEN = 1e-3  # time that is waited for the request before to be written [s]
-ENDED = 2.0  # time that it has to end [s]
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What a planner process is to do; it travels to it.
+    """What a planner process needs; it is pickled to it.
 
     Attributes:
-        problem: The problem without the obstacles that move.
+        problem: The problem without the dynamic obstacles.
         limits: Limits of motions.
         stopping: Limits of stops.
         settings: Parameters of the loop.
-        make: Makes the way of replanning; a function or class of a module.
-        arguments: Its arguments.
-        seed: Of random choices.
-        rehearses: Whether it makes replans of all sorts before it is ready, so that no code is loaded later.
+        make: Makes the replanner; a function or class of a module.
+        arguments: Arguments of ``make``.
+        seed: Seed of random choices.
+        rehearses: Whether it makes replans of all kinds before it is ready, so that no code is loaded later.
     """
 
     problem: Problem
@@ -135,21 +134,21 @@ class Work:
 
 
 class PlannerProcess:
-    """Replans made by a process of its own; one that dies is made anew.
+    """Replans in a process of its own, which is restarted when it dies.
 
     As a context manager it waits until the process is ready, and ends it.
 
     Attributes:
         process: The process.
-        restarts: How often it was made anew.
+        restarts: Number of restarts.
     """
 
     def __init__(self, work: Work, core: int | None = None) -> None:
         """Start a process.
 
         Args:
-            work: What it is to do.
-            core: Processor core that it keeps to; any by default.
+            work: What it needs.
+            core: Processor core that it is pinned to; any by default.
         """
         self._work, self._core, self.restarts = work, core, 0
         self._faults: list[str] = []
@@ -163,7 +162,7 @@ class PlannerProcess:
             command, pass_fds=[other.fileno()], env=environment, stdin=subprocess.DEVNULL, start_new_session=True
         )
         other.close()
-        if self._core is not None:  # not behind its imports: it begins where this thread is kept to
+        if self._core is not None:  # before its imports: it starts on the core that this thread is pinned to
             with suppress(OSError):
                 os.sched_setaffinity(self.process.pid, {self._core})
         self._connection: Connection[Any, Any] = mine
@@ -175,7 +174,7 @@ class PlannerProcess:
         """Wait until it is ready.
 
         Raises:
-            PlannerProcessError: It could not be made ready.
+            PlannerProcessError: It did not become ready.
         """
         try:
             if not self._connection.poll(STARTED):
@@ -183,7 +182,7 @@ class PlannerProcess:
             self._take(self._connection.recv())
         except (EOFError, OSError) as error:
             self.close()
-            raise PlannerProcessError("the planner process died while it was made ready") from error
+            raise PlannerProcessError("the planner process died before it was ready") from error
         except BaseException:  # Ctrl-C among them
             self.close()
             raise
@@ -193,15 +192,15 @@ class PlannerProcess:
         """End it."""
         self.close()
 
-    def _take(self, said: str) -> None:
-        if said:
-            raise PlannerProcessError(f"the planner process could not be made ready: {said}")
+    def _take(self, fault: str) -> None:
+        if fault:
+            raise PlannerProcessError(f"the planner process could not be made ready: {fault}")
         self._ready = True
 
     def submit(self, request: Request) -> bool:
-        """Send a request, which ends what the process is busy with; return whether it was sent.
+        """Send a request, which ends the process's current replan; return whether it was sent.
 
-        It is not where the process is not there, or one waits already.
+        It is not sent where the process is not ready, or ``SENT`` requests are unanswered.
         """
         if not self._ready or len(self._asked) >= SENT:
             return False
@@ -213,23 +212,23 @@ class PlannerProcess:
         return True
 
     def _send(self, message: object) -> None:
-        """Send a message as it is now from a thread: a process that does not read holds up who writes."""
+        """Send a message as it is now from a thread: a process that does not read blocks the writer."""
         self._sender = threading.Thread(target=_sent, args=(self._connection, pickle.dumps(message)), daemon=True)
         self._sender.start()
 
     def reply(self, now: float) -> Reply | None:
-        """Return the newest answer that has come, if any; a process that has been busy for ``HUNG`` is made anew."""
+        """Return the newest reply that has arrived, if any; restart a process that has been busy for ``HUNG``."""
         del now
         newest = None
         if self._asked and time.monotonic() > self._asked[0] + HUNG:
             self._replace("did not answer")
         try:
             while self._connection.poll():
-                said = self._connection.recv()
-                if isinstance(said, str):
-                    self._take(said)
+                message = self._connection.recv()
+                if isinstance(message, str):
+                    self._take(message)
                 else:
-                    newest = said
+                    newest = message
                     del self._asked[:1]
             if self.process.poll() is not None:  # a child of its own may still hold the connection open
                 self._replace("died")
@@ -240,25 +239,25 @@ class PlannerProcess:
         return newest
 
     def faults(self) -> tuple[str, ...]:
-        """Return what went wrong since the last call."""
+        """Return the faults since the last call."""
         found, self._faults = tuple(self._faults), []
         return found
 
     def _replace(self, why: str) -> None:
-        """Make the process anew."""
+        """Restart the process."""
         self._faults.append(f"the planner process {why}")
         self.close(wait=0.0)
         self.restarts += 1
         self._start()
 
     def close(self, wait: float = ENDED) -> None:
-        """End the process, by force where it goes on for some time [s]."""
+        """End the process, by force where it does not end within some time [s]."""
         self._ready = False
         self._sender.join(wait)
         if self._sender.is_alive():
             self.process.kill()
             self._sender.join()
-        self._connection.close()  # not before: what is still being sent would go to whatever gets its number
+        self._connection.close()  # not earlier: what is still being sent would go to the next owner of the descriptor
         try:
             self.process.wait(wait)
         except subprocess.TimeoutExpired:
@@ -267,6 +266,6 @@ class PlannerProcess:
 
 
 def _sent(connection: Connection[Any, Any], message: bytes) -> None:
-    """Send a message to a process that may not read it; where it has died, the next look at its answers says so."""
+    """Send a message to a process that may not read it; where it has died, the next call of ``reply`` finds out."""
     with suppress(OSError):
         connection.send_bytes(message)

@@ -47,7 +47,7 @@ class Outcome(StrEnum):
     REACHED = "reached"
     HIT_MOVING = "hit-moving"  # a contact while the robot moved
     HIT_AT_REST = "hit-at-rest"  # an obstacle came to the robot that stood
-    HIT_STILL = "hit-still"  # a contact with what stands still, or with itself
+    HIT_STILL = "hit-still"  # a contact with static obstacles, or with itself
     STUCK = "stuck"  # no motion for longer than is allowed
     TIMEOUT = "timeout"
     ABORTED = "aborted"  # the sensor failed, or the user interrupted it
@@ -83,7 +83,7 @@ class RunResult:
         reason: One sentence: which bodies touched, when, how deep; empty where the goal was reached.
         problem: The problem; obstacles that moved have the ``trajectory`` that they took, and ``appears``.
         robot: Name of the robot.
-        method: Name of the way of replanning.
+        method: Name of the replanner.
         prediction: How obstacles were predicted.
         clock: ``sim`` or ``real``.
         seed: The seed used.
@@ -91,7 +91,7 @@ class RunResult:
         events: What happened, by time.
         metrics: Numbers by name: ``time_to_goal`` [s], ``rest_time`` [s], ``stops``, ``replans_asked``,
             ``replans_accepted``, ``clearance`` [m], ``reaction_p95`` [s], ``broken_steps``, ``unguarded_steps``, ...
-        settings: Those of the loop and of the sensor, and the version of the table of costs; JSON's.
+        settings: Those of the loop and of the sensor, and the version of the compute-cost table; JSON's.
         robot_digest: Digest of the robot, see :func:`apex_ompl.robot.identity.digest`; empty where it is not known.
     """
 
@@ -237,7 +237,7 @@ def _parsed(data: Mapping[str, Any], source: str) -> RunResult:
     start: Array = found.problem.start_state(found.trajectory.joint_names)
     off = float(np.abs(found.trajectory.positions[0] - start).max())
     if off > START_TOLERANCE:
-        raise ParameterError("trajectory", f"a begin {off:.3g} rad away from it", "a motion from the problem's start")
+        raise ParameterError("trajectory", f"a start {off:.3g} rad away from it", "a motion from the problem's start")
     return found
 
 

@@ -1,6 +1,6 @@
-"""Estimates of obstacles that move: Kalman filters of constant velocity, and where obstacles may be.
+"""Estimates of dynamic obstacles: Kalman filters of constant velocity, and reachable sets.
 
-Each obstacle has a filter of its own whose state is place and velocity, with white noise of the acceleration
+Each obstacle has a filter of its own whose state is position and velocity, with white noise of the acceleration
 (Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2). The axes are alike, so that one covariance serves all three.
 """
 
@@ -20,13 +20,13 @@ from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, c
 from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array
 
-LOOKS = 16  # at an obstacle that are kept
+LOOKS = 16  # observations of an obstacle that are kept
 MOST_TRACKS = 64  # obstacles that are tracked at a time
 MOST_DOUBTED = 8  # places of one obstacle that contradict each other and are all kept
-GAP = 0.1  # longest time between two looks that counts as watched all through [s]
-GATE = 16.0  # squared Mahalanobis distance, of three axes, behind which an obstacle has turned
+GAP = 0.1  # longest time between two observations that counts as observed [s]
+GATE = 16.0  # squared Mahalanobis distance, of three axes, after which an obstacle has turned
 AXES = 3
-LEAST = 0.002  # clearance to margins that a robot has where it stands [m]
+LEAST = 0.002  # clearance beyond the margins that a robot has where it is at rest [m]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class TrackSettings:
         power: Power of the noise of the acceleration [m^2/s^3].
         speed: Standard deviation of the velocity on each axis of an obstacle that is new or has turned [m/s].
         widths: Standard deviations of the place by which obstacles count as larger.
-        speed_widths: Standard deviations of the velocity by which they grow behind the present.
+        speed_widths: Standard deviations of the velocity by which they grow after the present.
         most: Largest such growth [m/s].
     """
 
@@ -76,13 +76,13 @@ class Track:
 
     @classmethod
     def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings) -> Track:
-        """Begin with an observation."""
+        """Start with an observation."""
         spread = np.diag([settings.noise**2, settings.speed**2])
         looks = [(stamp, *seen.position)]
         return cls(seen, stamp, np.array(seen.position, float), np.zeros(AXES), spread, looks=looks)
 
     def update(self, seen: Obstacle, stamp: float, settings: TrackSettings) -> bool:
-        """Take a later observation; return False where the obstacle has turned, and the velocity begins anew."""
+        """Take a later observation; return False where the obstacle has turned, and the velocity starts anew."""
         dt, noise = stamp - self.stamp, settings.noise**2 + 1e-12
         forward = np.array([[1.0, dt], [0.0, 1.0]])
         drift = settings.power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
@@ -105,7 +105,7 @@ class Track:
         return True
 
     def growth(self, settings: TrackSettings) -> tuple[float, float]:
-        """Return by how much the obstacle counts as larger at the stamp [m], and behind it [m/s]."""
+        """Return by how much the obstacle counts as larger at the stamp [m], and after it [m/s]."""
         place, speed = (math.sqrt(max(v, 0.0)) for v in np.diag(self.covariance))
         return settings.widths * place, min(settings.speed_widths * speed, settings.most)
 
@@ -124,7 +124,7 @@ class Taken(NamedTuple):
 
 @dataclass(eq=False)
 class Tracker:
-    """What the loop knows of obstacles that move.
+    """What the loop knows of dynamic obstacles.
 
     A place that an obstacle cannot have come to since it was seen last contradicts an assumption: the obstacle may be
     where it is seen now, or the look was wrong. Both count as where it can be, until a later look tells.
@@ -163,7 +163,7 @@ class Tracker:
 
         Args:
             observation: The observation.
-            now: Time of the clock [s].
+            now: Clock time [s].
         """
         fault = self._fault(observation, now)
         if fault:
@@ -247,13 +247,13 @@ class Tracker:
         growth = [(margin + first, later) for first, later in (track.growth(self.settings) for track in some)]
         return self._placed([track.place for track in some], [track.velocity for track in some], growth)
 
-    def eased(self, dynamic: DynamicObstacles, q: Array, times: ArrayLike) -> DynamicObstacles:
+    def ease_margins(self, dynamic: DynamicObstacles, q: Array, times: ArrayLike) -> DynamicObstacles:
         """Take so much of the margins away that the robot may stand where it is, in place, and return the obstacles.
 
         Args:
             dynamic: Obstacles with margins.
             q: The robot's state, shape (dof,).
-            times: Times of the clock at which it may stand there [s].
+            times: Clock times at which it may stand there [s].
         """
         at = np.atleast_1d(np.asarray(times, float))
         clear, _ = clearance_in_time(self.kernel, dynamic, np.repeat(q[None], len(at), axis=0), at, 2.0 * LEAST)
@@ -327,7 +327,7 @@ class Tracker:
         return made
 
 
-def as_they_are(
+def true_motions(
     kernel: Kernel, present: Iterable[Obstacle], time: float, allowed: Iterable[tuple[str, str]]
 ) -> DynamicObstacles:
     """Return obstacles as they truly move now, from a time on [s]."""

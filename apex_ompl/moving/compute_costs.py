@@ -33,7 +33,7 @@ def cost_table(path: Path = TABLE) -> Mapping[str, Any]:
     try:
         seconds = {str(kind): float(value) for kind, value in table["seconds"].items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise FileFormatError(str(path), "seconds", "not a table of costs", "expected seconds by kind") from error
+        raise FileFormatError(str(path), "seconds", "not a compute-cost table", "expected seconds by kind") from error
     return {**table, "seconds": seconds}
 
 

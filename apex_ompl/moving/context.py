@@ -29,11 +29,11 @@ SAME_TIME = 1e-9  # [s]
 
 @dataclass(frozen=True, eq=False)
 class Following:
-    """A motion that a robot follows; behind its end it stands.
+    """A motion that a robot follows; after its end it stands.
 
     Attributes:
         motion: The motion, which ends at rest.
-        start_time: Time of the clock at which it starts [s].
+        start_time: Clock time at which it starts [s].
         to_goal: Whether it ends at a goal.
     """
 
@@ -49,30 +49,30 @@ class Following:
 
     @cached_property
     def end(self) -> float:
-        """Time of the clock from which on the robot stands [s]."""
+        """Clock time from which on the robot stands [s]."""
         return self.start_time + self.motion.duration
 
     def after(self, head: Trajectory, start_time: float) -> Following:
-        """Return the motion behind another one, which begins at a time of the clock [s] and ends where it begins."""
+        """Return the motion behind another one, which starts at a clock time [s] and ends where it starts."""
         return Following(concatenate([head, self.motion]), start_time, self.to_goal)
 
     def at(self, time: float) -> Start:
-        """Return what the robot does at a time of the clock [s]."""
+        """Return what the robot does at a clock time [s]."""
         at = min(max(time - self.start_time, 0.0), self.motion.duration)
         if at >= self.motion.duration - SAME_TIME:
             return Start.at_rest(self.motion.positions[-1].copy())
         return Start(*self.motion.states(np.array([at]))[:, 0])
 
     def state(self, time: float) -> Array:
-        """Return the robot's state at a time of the clock, shape (dof,)."""
+        """Return the robot's state at a clock time, shape (dof,)."""
         return self.at(time).position
 
     def at_rest(self, time: float) -> bool:
-        """Whether the robot stands from a time of the clock on [s]."""
+        """Whether the robot stands from a clock time on [s]."""
         return time >= self.end - SAME_TIME
 
     def piece(self, start: float, end: float) -> Trajectory:
-        """Return what the robot does between two times of the clock [s]."""
+        """Return what the robot does between two clock times [s]."""
         if self.at_rest(start) or end <= self.start_time + SAME_TIME:
             times = np.array([0.0, end - start] if end > start else [0.0])
             q = np.repeat(self.motion.positions[[-1 if self.at_rest(start) else 0]], len(times), axis=0)
@@ -104,10 +104,10 @@ GRAZING = 1e-4  # distance from still things and own parts, such as held objects
 
 @dataclass(eq=False)
 class RunContext:
-    """The robot among what stands still.
+    """The robot among static obstacles, and the settings of the run.
 
     Attributes:
-        setup: The problem without the obstacles that move.
+        setup: The problem without the dynamic obstacles.
         limits: Limits of motions; at most those of stops.
         stopping: Limits of stops.
         settings: Parameters of the loop.
@@ -157,9 +157,9 @@ class RunContext:
         return self.keeps_limits(motion) and self.is_clear(curve_of(motion), budget)
 
     def is_clear(self, curve: Curve, budget: ComputeBudget | None = None) -> bool:
-        """Whether a curve is proved free of what stands still and of the robot itself.
+        """Whether a curve is proved free of static obstacles and of the robot itself.
 
-        It does not graze either, but where it begins like that: pieces of it are proved again where they are joined.
+        It does not graze either, but where it starts like that: pieces of it are proved again where they are joined.
         """
         proof = self.checker.prove(curve, tolerance=0.0)
         if budget is not None:
@@ -172,7 +172,7 @@ class RunContext:
         return self.is_clear(Curve.polyline(np.stack([first, last])), budget)
 
     def _touches(self, q: Array) -> bool:
-        """Whether what stands still or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
+        """Whether static obstacles or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
         states, still = np.stack([q, q]), np.zeros((2, len(q)))
         proof = self.checker.prove(Curve.cubic(np.array([0.0, 1.0]), states, still, still), tolerance=0.0)
         return not proof or proof.clearance < GRAZING
@@ -194,8 +194,8 @@ class RunContext:
         Args:
             dynamic: The obstacles.
             following: The motion.
-            start: Time of the clock from which on it is looked at [s].
-            until: Time until which it is looked at [s], behind its end, too.
+            start: Clock time from which on it is looked at [s].
+            until: Time until which it is looked at [s], after its end, too.
             budget: Gets the number of intervals.
         """
         zero = following.start_time
@@ -227,8 +227,8 @@ class RunContext:
         Args:
             reachable: The obstacles, as large as all that they can reach.
             following: The motion.
-            now: Time of the clock [s].
-            then: Time of the clock at which the stop begins [s].
+            now: Clock time [s].
+            then: Clock time at which the stop starts [s].
         """
         if following.at_rest(then):
             stopped = Following.standing(following.motion.positions[-1], then, self.names, to_goal=following.to_goal)
@@ -245,14 +245,14 @@ class RunContext:
     def foreseen_stops(
         self, predicted: DynamicObstacles, following: Following, moments: Array, age: float, spread: float
     ) -> tuple[int, int]:
-        """Return behind how many times of the clock, from the first on, stops from a motion will hardly be refused.
+        """Return behind how many clock times, from the first on, stops from a motion will hardly be refused.
 
-        They are proved by what will be known then, as far as can be told now (:func:`stops_proved`).
+        They are proved by what will be known then, by what is known now (:func:`stops_proved`).
 
         Args:
             predicted: The obstacles.
             following: The motion.
-            moments: Times of the clock, shape (N,) [s].
+            moments: Clock times, shape (N,) [s].
             age: How old what is known will be [s].
             spread: By how much more than the error assumed places will differ from those expected [m].
 
@@ -272,7 +272,7 @@ class RunContext:
         return count, len(left)
 
     def unproved_stop(self, following: Following, then: float) -> Following:
-        """Return a stop from a motion along its path from a time of the clock on [s]."""
+        """Return a stop from a motion along its path from a clock time on [s]."""
         made = stop_along(following.motion, then - following.start_time, self.stopping)
         return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))
 

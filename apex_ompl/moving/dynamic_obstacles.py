@@ -1,4 +1,4 @@
-"""Obstacles that move, beside the scene: proofs of timed motions among them, and clearances in time."""
+"""Dynamic obstacles, beside the scene: proofs of timed motions among them, and clearances in time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PREPARED = 64  # motions whose curves are kept
 
 
 class DynamicObstacles:
-    """Obstacles that move at constant velocity without turning, outside of the scene that a kernel has.
+    """Dynamic obstacles at constant velocity without turning, outside of the scene that a kernel has.
 
     Each has a place and a velocity at a time stamp, and a margin by which it counts as larger, which may grow behind
     the time stamp. An update is a write to an array.
@@ -120,7 +120,7 @@ class DynamicObstacles:
             position: Where it was at the time stamp, shape (3,) [m].
             velocity: Shape (3,) [m/s].
             stamp: Time stamp [s].
-            growth: Margin at the time stamp [m], and its growth behind it [m/s]; neither is negative.
+            growth: Margin at the time stamp [m], and its growth after it [m/s]; neither is negative.
 
         Raises:
             UnknownNameError: There is no such obstacle.
@@ -149,7 +149,7 @@ class DynamicObstacles:
         Args:
             positions: Where they were at the time stamps, shape (N, 3) [m].
             velocities: Shape (N, 3) [m/s].
-            growth: Margins at the time stamps [m], and their growth behind them [m/s], shape (N, 2).
+            growth: Margins at the time stamps [m], and their growth after them [m/s], shape (N, 2).
             stamps: Time stamps, shape (N,) [s].
         """
         other = self.larger(0.0)
@@ -221,7 +221,7 @@ def prove_motion(
     kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, start: float = 0.0, end: float | None = None,
     *, clock: float = 0.0, shortest: float = SHORTEST,
 ) -> Conflict:  # fmt: skip
-    """Prove that a timed motion stays apart from obstacles that move, and find the first moment that is not proved.
+    """Prove that a timed motion stays apart from dynamic obstacles, and find the first moment that is not proved.
 
     The proof is that of the sphere covers along the motion's own cubic pieces
     (:mod:`apex_ompl.kernel.compiled.dynamic_obstacles`): it is sound, and may leave contacts of some millimeters open
@@ -230,7 +230,7 @@ def prove_motion(
     Args:
         kernel: The kernel of the robot with what it holds.
         dynamic: The obstacles.
-        motion: The motion; behind its end the robot stands.
+        motion: The motion; after its end the robot stands.
         start: Where on the motion to start [s].
         end: Where to end [s], by default at its end.
         clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
@@ -314,7 +314,7 @@ class Piece(NamedTuple):
 
 
 class ScriptedDynamicObstacles:
-    """Obstacles that move by scripts, beside a kernel's scene.
+    """Dynamic obstacles by scripts, beside a kernel's scene.
 
     Attributes:
         kernel: The kernel of the robot with what it holds.
@@ -346,7 +346,7 @@ class ScriptedDynamicObstacles:
         a hand is outside its limits.
 
         Args:
-            motion: The motion; behind its end the robot stands.
+            motion: The motion; after its end the robot stands.
             times: Shape (N,), increasing from 0 or more [s].
         """
         found = np.full(len(times), np.inf)

@@ -160,12 +160,12 @@ def joining_fault(context: RunContext, found: Following, request: Request) -> st
     states = motion.positions[0], motion.velocities[0], motion.accelerations[0]
     off = max(float(np.abs(one - other).max()) for one, other in zip(states, joined, strict=True))
     if abs(found.start_time - request.join) > SAME_TIME or not off <= SAME_STATE:
-        return "it does not begin where the robot will be"
+        return "it does not start where the robot will be"
     if motion.velocities[-1].any() or motion.accelerations[-1].any():
         return "it does not end at rest"
     if found.to_goal and not context.is_goal(motion.positions[-1]):
         return "it does not end at a goal"
     verified = context.settings.verified
     if not (context.clear_of_static(motion) if verified else context.keeps_limits(motion)):
-        return "it exceeds limits, or is not proved clear of what stands still"
+        return "it exceeds limits, or is not proved clear of static obstacles"
     return ""

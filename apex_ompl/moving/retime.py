@@ -1,4 +1,4 @@
-"""Speed along a known path among obstacles that move: wait, slow down, hurry.
+"""Speed along a known path among dynamic obstacles: wait, slow down, hurry.
 
 The path keeps its shape, and time along it is chosen anew (path-velocity decomposition, Kant and Zucker 1986; LaValle
 2006, section 7.1.3), among safe intervals of time (Phillips and Likhachev 2011).
@@ -113,9 +113,9 @@ def retime(
     clock: float = 0.0,
     hold: float = 1.0, horizon: float = 20.0, deviation: float = 1.5e-3,
 ) -> Retimed:  # fmt: skip
-    """Return the motion along the rest of a path that arrives first, among obstacles that move.
+    """Return the motion along the rest of a path that arrives first, among dynamic obstacles.
 
-    It begins with the state of the given motion at ``time`` exactly, ends at rest where that ends, and keeps the
+    It starts with the state of the given motion at ``time`` exactly, ends at rest where that ends, and keeps the
     limits. Its places are kept out of the blocked intervals (:func:`apex_ompl.moving.retime.blocked`), so that
     :func:`apex_ompl.moving.dynamic_obstacles.prove_motion` seldom finds a conflict; only that is the proof.
 
@@ -125,7 +125,7 @@ def retime(
         motion: A motion within the limits that ends at rest.
         limits: Limits of the joints.
         time: Where on the motion to start [s].
-        clock: Time of the dynamic obstacles' stamps at which the result begins [s].
+        clock: Time of the dynamic obstacles' stamps at which the result starts [s].
         hold: Time for which the end must stay free from the arrival on [s].
         horizon: Largest duration of the result [s].
         deviation: Largest distance of any joint from the path [rad].
@@ -310,7 +310,7 @@ class Blocked(NamedTuple):
     """Intervals of time in which places along a motion are blocked.
 
     Attributes:
-        places: Begins and ends of the places, in the motion's own time, shape (P, 2) [s].
+        places: Starts and ends of the places, in the motion's own time, shape (P, 2) [s].
         spans: Their intervals in order, shape (P, MOST_SPANS, 2) [s of the dynamic obstacles' stamps].
         counts: Numbers of them, shape (P,).
     """
@@ -346,7 +346,7 @@ def blocked(
         kernel: The kernel of the robot with what it holds.
         dynamic: The obstacles.
         motion: The motion.
-        places: Begins and ends of pieces of the motion, in its own time and in order, shape (P, 2) [s]; the same twice
+        places: Starts and ends of pieces of the motion, in its own time and in order, shape (P, 2) [s]; the same twice
             for a single state.
         start: First time that is looked at [s of the dynamic obstacles' stamps].
         end: The last one [s].

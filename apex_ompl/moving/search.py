@@ -24,7 +24,7 @@ from apex_ompl.timing.moving_start import between
 from apex_ompl.types import Array
 
 MOTIONS = MotionSettings(samples=2)
-STATES = 64  # of a motion that splines begin from
+STATES = 64  # of a motion that splines start from
 EARLIER = 0.02  # by which a motion must arrive before one without a conflict to replace it [s]
 GUARDED, AGE = 0.04, 0.08  # times between stops of a motion that are looked at, and how old what is known will be [s]
 SOON = 0.8  # time before a conflict from which on a motion is taken that the guard may stop in the way [s]
@@ -32,7 +32,7 @@ TOGETHER = 16  # such times that are looked at in one call
 SPREAD = 0.01  # by which places that are seen differ from those that are expected [m]
 NARROW = 1.0  # time that a motion that the guard may stop must gain over one that it will hardly stop [s]
 GOOD = 1.2  # duration of a motion with which a replan ends, as a multiple of the direct one's
-ENOUGH_TIME = 0.2  # share of the budget behind which it ends with any motion that has room
+ENOUGH_TIME = 0.2  # share of the budget after which it ends with any motion that has room
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
 
 
@@ -41,10 +41,10 @@ class Search:
     """One replan under way: what its parts share.
 
     Attributes:
-        context: The robot among what stands still.
+        context: The robot among static obstacles, and the settings of the run.
         request: What is asked for.
         budget: What was spent.
-        start: What the robot does when the motion begins.
+        start: What the robot does when the motion starts.
         rng: Source of random choices.
         best: The best motion so far, or None.
         part: What found it.
@@ -154,7 +154,7 @@ class Search:
         return NARROW if math.isinf(conflict) or self.request.conflict < self.request.join + SOON else math.inf
 
     def unguarded_from(self, motion: Trajectory) -> float:
-        """Return the time of the clock from which on stops from a motion will hardly be proved, or infinity [s]."""
+        """Return the clock time from which on stops from a motion will hardly be proved, or infinity [s]."""
         settings, one, predicted = self.context.settings, self.following(motion), self.request.predicted
         if not settings.guarded:
             return math.inf
@@ -172,7 +172,7 @@ class Search:
 
     @property
     def soonest(self) -> float:
-        """Time of the clock at which a motion begins at the earliest: a robot at rest does not wait [s]."""
+        """Clock time at which a motion starts at the earliest: a robot at rest does not wait [s]."""
         request = self.request
         soon = request.asked + self.budget.spent + self.context.settings.period
         return min(soon, request.join) if request.following.at_rest(request.asked) else request.join
@@ -252,7 +252,7 @@ LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
 
 
 def fresh_checker(context: RunContext) -> CollisionChecker:
-    """Return a checker of what stands still."""
+    """Return a checker of static obstacles."""
     setup = context.setup
     return CollisionChecker(setup.robot, setup.problem.scene, setup.problem.attached, setup.problem.allowed)
 

@@ -27,13 +27,13 @@ class LoopSettings:
     """Parameters of the closed loop.
 
     Attributes:
-        watched: Time for which obstacles were observed before the run begins [s].
+        watched: Time for which obstacles were observed before the run starts [s].
         period: Time between two looks at the world [s].
-        budget: Time that a replan may take; what it finds begins this long after it was asked for [s].
+        budget: Time that a replan may take; what it finds starts this long after it was asked for [s].
         latency: Time after which the answer of a replan is known [s]; -1 charges what the replan did by the table of
             costs.
         prediction: One of ``PREDICTIONS``: what plans are proved against.
-        guarded: Whether the robot only goes on while a stop behind the next step is proved.
+        guarded: Whether the robot only goes on while a stop after the next step is proved.
         evade: What a robot at rest does that an obstacle is about to touch. ``proved``: it steps aside only along a
             motion that is proved clear of all that obstacles can reach until it is at rest again, so that it is at rest
             whenever it is touched. ``risk``: also along one that is only predicted to be clear; the steps without a
@@ -42,12 +42,12 @@ class LoopSettings:
         verified: Whether motions are taken only where they are proved.
         from_rest: Whether the robot stops where its motion is blocked, and plans anew only where it stands.
         by_distance: Whether a motion counts as blocked where an obstacle is nearer than ``trigger``, instead of where a
-            conflict is predicted; once motion began nearer than that, where one comes nearer still.
+            conflict is predicted; once motion started nearer than that, where one comes nearer still.
         trigger: That distance, lambda_obs of the paper's Algorithm 1 [m].
         hastens: Whether a faster motion is looked for while one without a conflict is followed.
         hold: Time for which the goal must stay clear from the arrival on [s].
         rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
-        margin: Distance that is kept from obstacles that move [m].
+        margin: Distance that is kept from dynamic obstacles [m].
         clearance_margin: Distance beyond it at which motions are optimized to pass by, where there is room [m].
         error: Largest error of an observed place, for the guarantee [m]; None is that of the sensor.
         fastest: Largest speed of any obstacle, for the guarantee [m/s]; None is that of the world.

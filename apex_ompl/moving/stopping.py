@@ -71,7 +71,7 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
 def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float = DEVIATION) -> Stop:
     """Return the soonest stop along the path of a motion, among profiles of slowing down.
 
-    It begins with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
+    It starts with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
     and is the rest of the motion itself where no profile ends sooner (:mod:`apex_ompl.kernel.compiled.path_stop`).
 
     Args:

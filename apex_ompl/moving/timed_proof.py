@@ -1,4 +1,4 @@
-"""Proof that a timed motion stays apart from obstacles that move: sphere covers first, exact shapes where they end."""
+"""Proof that a timed motion stays apart from dynamic obstacles: sphere covers first, exact shapes where they end."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class TimedProver:
     """Proofs of motions of one robot among dynamic obstacles; a :class:`CollisionChecker` proves those among others.
 
     Attributes:
-        dynamic: The obstacles that move.
+        dynamic: The dynamic obstacles.
         obstacles: Their records, where they are at time 0.
     """
 
@@ -57,11 +57,11 @@ class TimedProver:
         self, checker: CollisionChecker, obstacles: Iterable[Obstacle], allowed: Sequence[tuple[str, str]] = (),
         *, margin: float = 0.0,
     ) -> None:  # fmt: skip
-        """Prove motions of the robot of a checker, with what it holds, among obstacles that move.
+        """Prove motions of the robot of a checker, with what it holds, among dynamic obstacles.
 
         Args:
             checker: The robot; its obstacles are not looked at.
-            obstacles: The obstacles that move, where they are at time 0.
+            obstacles: The dynamic obstacles, where they are at time 0.
             allowed: Pairs of names of bodies that may touch.
             margin: Distance to keep from them [m].
 
@@ -79,7 +79,7 @@ class TimedProver:
         self._exact: dict[float, CollisionChecker] = {}  # by length of the slices
 
     def prove(self, motion: Trajectory, *, stop: Callable[[], bool] = lambda: False) -> TimedProof:
-        """Prove that a motion that begins at time 0 stays apart from the dynamic obstacles, to its end.
+        """Prove that a motion that starts at time 0 stays apart from the dynamic obstacles, to its end.
 
         Args:
             motion: The motion.
@@ -237,7 +237,7 @@ def check_timed_path(
 
 
 def _intervals(dynamic: Sequence[Obstacle], until: float) -> list[tuple[float, float]]:
-    """Return begins and ends of the intervals of a check [s].
+    """Return starts and ends of the intervals of a check [s].
 
     In none of them does an obstacle change its velocity, appear, or move more than ``OBSTACLE_STEP``.
 

@@ -1,4 +1,4 @@
-"""Optimization in space and time: splines in time among obstacles that move, from a moving start to rest at a goal."""
+"""Optimization in space and time: splines in time among dynamic obstacles, from a moving start to rest at a goal."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from apex_ompl.timing.spline_method import least_knot_spacing, spline_in_time, s
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive
 
-PINNED = 3  # control points at each end that say where and how a motion begins and ends
+PINNED = 3  # control points at each end that say where and how a motion starts and ends
 KNOT_SPACING = 0.1  # that is aimed at [s]
 LEAST_SPANS, MOST_SPANS = 8, 40
 ROUNDS = 4  # of steps, between which a motion over its limits gets more time
@@ -57,7 +57,7 @@ class MotionSettings:
 
 
 class Start(NamedTuple):
-    """What a robot does when a motion begins: position, velocity and acceleration, each of shape (dof,)."""
+    """What a robot does when a motion starts: position, velocity and acceleration, each of shape (dof,)."""
 
     position: Array
     velocity: Array
@@ -75,12 +75,12 @@ class Start(NamedTuple):
 
 
 class TimedSpline(NamedTuple):
-    """A uniform cubic B-spline in time, which begins in a given way and ends at rest.
+    """A uniform cubic B-spline in time, which starts in a given way and ends at rest.
 
     Attributes:
-        control: Control points, shape (P, dof) [rad]; the first three say how it begins, the last three are the goal.
+        control: Control points, shape (P, dof) [rad]; the first three say how it starts, the last three are the goal.
         spacing: Knot spacing [s].
-        start: How it begins.
+        start: How it starts.
     """
 
     control: Array
@@ -97,10 +97,10 @@ class TimedSpline(NamedTuple):
         """Return the spline whose control points are states of a motion, evenly spaced in time.
 
         Args:
-            states: States of the motion, evenly spaced in time, shape (N, dof); from a moving start they begin as that.
+            states: States of the motion, evenly spaced in time, shape (N, dof); from a moving start they start as that.
             duration: Its duration [s]; the spline takes a knot spacing longer, since it rounds the end, and another one
                 from rest.
-            start: How the spline begins.
+            start: How the spline starts.
             goal: Where it ends, shape (dof,).
 
         Raises:
@@ -118,7 +118,7 @@ class TimedSpline(NamedTuple):
         return cls(control, spacing, start).lasting(spacing)
 
     def lasting(self, spacing: float) -> TimedSpline:
-        """Return the spline with another knot spacing [s] and the same begin."""
+        """Return the spline with another knot spacing [s] and the same start."""
         control = self.control.copy()
         control[:PINNED] = start_points(self.start, spacing)
         if not self.start.moves:
@@ -126,7 +126,7 @@ class TimedSpline(NamedTuple):
         return TimedSpline(control, spacing, self.start)
 
     def trajectory(self, joint_names: Sequence[str]) -> Trajectory:
-        """Return the motion itself; begin and end are exact, and so are joints that stay."""
+        """Return the motion itself; start and end are exact, and so are joints that stay."""
         motion = spline_in_time(self.control, self.spacing, tuple(joint_names), self.start)
         inner = motion.positions[1:-1]  # averages of control points
         np.clip(inner, self.control.min(axis=0), self.control.max(axis=0), out=inner)
@@ -163,7 +163,7 @@ class MotionOptimizer:
 
         Args:
             spline: The spline.
-            clock: Time of the dynamic obstacles' stamps when it begins [s].
+            clock: Time of the dynamic obstacles' stamps when it starts [s].
             steps: Most steps; by default the settings'.
             enough: The steps end when the clearances at the samples reach this [m].
             damping: Of the first step; by default the settings'. The report has that to go on with.
@@ -192,7 +192,7 @@ class MotionOptimizer:
         Args:
             spline: Where to start from.
             accepts: The full check; asked about motions within the limits.
-            clock: Time of the dynamic obstacles' stamps when it begins [s].
+            clock: Time of the dynamic obstacles' stamps when it starts [s].
             stop: Asked between rounds whether to give up.
         """
         names = self.kernel.robot.joint_names
@@ -252,7 +252,7 @@ class MotionOptimizer:
 
 @lru_cache(maxsize=64)
 def _grid(points: int, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
-    """Return weights at the samples, where they begin, and the matrix of the speed over the share of the motion."""
+    """Return weights at the samples, where they start, and the matrix of the speed over the share of the motion."""
     spans = points - PINNED
     at = (np.arange(samples) + 0.5) / samples
     weights = np.tile(_basis(at), (spans, 1))
@@ -280,7 +280,7 @@ ROUND, MOST_ROUNDS = 4, 8  # optimizer steps in a round, and rounds that a candi
 PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
 CLEAR = -0.003  # clearance at the samples from which on a proof is tried; spheres protrude [m]
 ENOUGH = 0.03  # at which a round ends early [m]
-REFIT = 64  # states of a candidate that begins from elsewhere
+REFIT = 64  # states of a candidate that starts from elsewhere
 FASTER = 0.9  # factor on the duration of a motion that is found, from which a faster one is looked for
 LONGEST = 60.0  # duration at which a candidate is of no use [s]
 LEAST = 1e-6  # clearance cost that counts as none
@@ -331,8 +331,8 @@ class MotionPool:
 
         Args:
             optimizer: Improves motions among the obstacles.
-            start: What the robot does when the motions begin.
-            clock: Time of the clock then [s].
+            start: What the robot does when the motions start.
+            clock: Clock time then [s].
             budget: Gets the samples that are looked at.
             accepts: The proof.
             clearance_margin: How much nearer than the obstacles of the optimizer motions may come, of which a proof is tried [m].
@@ -358,9 +358,9 @@ class MotionPool:
         return one
 
     def carry(self, one: MotionCandidate, shift: float) -> None:
-        """Take a candidate of an earlier pool in, whose motion began some time before [s].
+        """Take a candidate of an earlier pool in, whose motion started some time before [s].
 
-        It goes on as it is where the robot stands where it stood, and begins from where the robot is now else.
+        It goes on as it is where the robot stands where it stood, and starts from where the robot is now else.
         """
         old, now = one.spline.start, self._start
         resting = not (old.velocity.any() or now.velocity.any() or now.acceleration.any())

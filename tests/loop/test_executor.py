@@ -318,14 +318,14 @@ def renamed(context: RunContext, request: Request) -> Following:
 
 @pytest.mark.parametrize(
     ("find", "name", "why"),
-    [(shifted, PROBLEM, "it does not begin where the robot will be"),
-     (under_way, PROBLEM, "it does not begin where the robot will be"),
-     (hasty, PROBLEM, "it does not begin where the robot will be"),
+    [(shifted, PROBLEM, "it does not start where the robot will be"),
+     (under_way, PROBLEM, "it does not start where the robot will be"),
+     (hasty, PROBLEM, "it does not start where the robot will be"),
      (unfinished, PROBLEM, "it does not end at rest"),
      (boasting, PROBLEM, "it does not end at a goal"),
      (renamed, PROBLEM, "it is a motion of other joints"),
-     (fast, PROBLEM, "it exceeds limits, or is not proved clear of what stands still"),
-     (line, BLOCKED, "it exceeds limits, or is not proved clear of what stands still"),
+     (fast, PROBLEM, "it exceeds limits, or is not proved clear of static obstacles"),
+     (line, BLOCKED, "it exceeds limits, or is not proved clear of static obstacles"),
      (lambda context, request: None, PROBLEM, "nothing was found")],
     ids=["shifted", "under-way", "hasty", "unfinished", "boasting", "renamed", "fast", "blocked", "nothing"],
 )  # fmt: skip

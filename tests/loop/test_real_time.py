@@ -79,7 +79,7 @@ def test_faults_of_the_planner_end_defined() -> None:
     done, report, process = go(*["raises"] * 4, *["nonsense"] * 4, *["late"] * 2, "killed")
     check_defined(done, report, process)
     why = {event.data["why"] for event in done.events if event.kind == "rejected"}
-    assert {"ValueError: a bad number", "it does not begin where the robot will be", "no answer came in time"} <= why
+    assert {"ValueError: a bad number", "it does not start where the robot will be", "no answer came in time"} <= why
     assert process.restarts and any(event.kind == "planner fault" for event in done.events)
 
 

@@ -27,7 +27,7 @@ class PathIntegral:
     stands still, and to the robot itself. The mean, weighted by the softmax of the costs, is followed by a stop and
     proved; where the whole horizon is not, a shorter part of it is tried.
 
-    512 rollouts of 20 steps take about 28 ms by the table of costs, since what stands still and the robot itself are
+    512 rollouts of 20 steps take about 28 ms by the compute-cost table, since static obstacles and the robot itself are
     looked at in every fourth state only. Three sets of parameters were tried in 4 to 8 worlds of each of the kinds
     ``moving``, ``popup`` and ``interceptor`` of the validation split.
 
@@ -38,11 +38,11 @@ class PathIntegral:
         knots: Number of values of the noise of a joint over the horizon, between which it is linear.
         noise: Least and largest standard deviation of the accelerations of a rollout, as shares of the largest.
         temperature: Of the softmax, in units of the cost.
-        clearance_margin: Clearance to obstacles that move below which a state costs [m].
-        own_margin: The same to what stands still and between bodies of the robot [m].
+        clearance_margin: Clearance to dynamic obstacles below which a state costs [m].
+        own_margin: The same to static obstacles and between bodies of the robot [m].
         collision: Cost of contact for a second, in rad of distance for a second.
         effort: Weight of the accelerations squared, as shares of the largest.
-        sparse: States of a rollout are looked at for what stands still at every so manieth step.
+        sparse: States of a rollout are looked at for static obstacles at every so manieth step.
         counts: Numbers of steps of which a proof is tried.
         near: Distance of any joint to a goal from which on the straight motion to it is tried first [rad].
     """
@@ -144,7 +144,7 @@ class PathIntegral:
 
 
 def near_clearance(search: Search, states: Array, clearance_margin: float, near: float) -> Array:
-    """Return clearances of states to what stands still and of the robot to itself [m], up to a berth, shape (N,).
+    """Return clearances of states to static obstacles and of the robot to itself [m], up to a berth, shape (N,).
 
     Where what is held may be closer at the nearest goal, that of the robot to itself counts from there, as far as a
     state is nearer than ``near`` to the goal [rad].

@@ -23,7 +23,7 @@ class Field(NamedTuple):
     """A potential in joint space: towards a goal, and away from what is near (Khatib 1986).
 
     The attractive part is ``attraction * |q - goal|^2 / 2``, which goes on as a cone beyond ``cone``. The repulsive
-    parts are ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: of obstacles that move, of what
+    parts are ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: of dynamic obstacles, of what
     stands still, and of the robot to itself. The last two fade with the square of the distance to the goal inside the
     cone, so that a goal close to contact is a minimum (Ge and Cui 2000).
 
@@ -31,10 +31,10 @@ class Field(NamedTuple):
         goal: Shape (dof,).
         attraction: Gain [1/s^2].
         cone: Distance to the goal from which on its force is constant [rad].
-        repulsion: Gain for obstacles that move [rad^2/s^2].
-        own_repulsion: Gain for what stands still and the robot itself [rad^2/s^2].
-        reach: Clearance to obstacles that move below which they repel [m].
-        own_reach: The same of what stands still and of the robot itself [m].
+        repulsion: Gain for dynamic obstacles [rad^2/s^2].
+        own_repulsion: Gain for static obstacles and the robot itself [rad^2/s^2].
+        reach: Clearance to dynamic obstacles below which they repel [m].
+        own_reach: The same of static obstacles and of the robot itself [m].
     """
 
     goal: Array
@@ -51,8 +51,8 @@ class Field(NamedTuple):
         """Return the potential [rad^2/s^2] at a state, shape (dof,), and its force, shape (dof,) [rad/s^2].
 
         Args:
-            kernel: The robot among what stands still.
-            dynamic: The obstacles that move.
+            kernel: The robot among static obstacles.
+            dynamic: The dynamic obstacles.
             q: The state.
             time: Time of the dynamic obstacles' stamps [s].
         """

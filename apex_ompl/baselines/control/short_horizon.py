@@ -23,7 +23,7 @@ from apex_ompl.types import Array
 
 Control = Callable[[int, Array, Array], Array]
 STRAIGHT = 32  # states of a straight motion
-STRETCHES, SLOWER = 12, 1.05  # changes of the duration of a straight motion that begins while moving, and their least
+STRETCHES, SLOWER = 12, 1.05  # changes of the duration of a straight motion that starts while moving, and their least
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Horizon:
                 speeds, and the states.
 
         Returns:
-            Control points, shape (K + 3, N, dof) [rad]: the first three say how the motion begins; number k is about
+            Control points, shape (K + 3, N, dof) [rad]: the first three say how the motion starts; number k is about
             where the robot is at time (k - 1) h. The last two are the same.
         """
         count, rollouts = shape
@@ -148,7 +148,7 @@ def along(search: Search, states: Array, goal: Array) -> Trajectory | None:
     """Return the motion whose spline has some states as control points and ends in one, or None within the limits.
 
     Args:
-        search: The replan, which says how the motion begins.
+        search: The replan, which says how the motion starts.
         states: States of the motion, evenly spaced in time, shape (N, dof).
         goal: Where it ends, shape (dof,).
     """

@@ -91,7 +91,7 @@ def free_of_self_collision(kernel: Kernel, first: Array, last: Array) -> Flags:
 
     Args:
         kernel: The robot.
-        first: States that they begin at, shape (M, dof).
+        first: States that they start at, shape (M, dof).
         last: States that they end at, shape (M, dof).
     """
     found = np.ones(len(first), bool)

@@ -83,7 +83,7 @@ class LazySearch:
     def __init__(
         self, graph: Graph, usable: Flags, starts: Array, goals: Array, *, free_nodes: Flags | None = None
     ) -> None:  # fmt: skip
-        """Begin with all edges between nodes that may be used.
+        """Start with all edges between nodes that may be used.
 
         Args:
             graph: The graph.

@@ -24,8 +24,8 @@ PLANNER = "damon"
 class DamonReplanner:
     """The planner ``damon`` in the loop: :class:`~apex_ompl.baselines.damon.latent_graph.Damon` with its defaults.
 
-    Which nodes are free of what stands still is found before a run, and which edges when they are first used in it. At
-    each replan, nodes that an obstacle hits where it stands when the new motion begins are left out, and A* finds a
+    Which nodes are free of static obstacles is found before a run, and which edges when they are first used in it. At
+    each replan, nodes that an obstacle hits where it stands when the new motion starts are left out, and A* finds a
     path over the rest. It is made shorter between its nodes, timed, and proved among the obstacles as they are
     predicted.
 
@@ -42,7 +42,7 @@ class DamonReplanner:
     _start: bytes = b""
 
     def prepare(self, context: RunContext) -> None:
-        """Load the graph, and find the nodes that are free of what stands still.
+        """Load the graph, and find the nodes that are free of static obstacles.
 
         Raises:
             MissingFileError: The model is missing.
@@ -94,14 +94,14 @@ class DamonReplanner:
         return Answer(search.following(motion) if search.accepts(motion) else None, "graph", budget)
 
     def _blocked_from(self, start: Array) -> set[Motion]:
-        """Return the motions that what stands still is known to block; those from other starts are forgotten."""
+        """Return the motions that static obstacles is known to block; those from other starts are forgotten."""
         key = start.tobytes()
         if key != self._start:
             self._start, self._blocked = key, {one for one in self._blocked if one[0] != "start"}
         return self._blocked
 
     def _is_free(self, clear: Clearances, first: Array, last: Array) -> bool:
-        """Whether a straight motion is clear behind its first state; that is proved once of what stands still."""
+        """Whether a straight motion is clear after its first state; that is proved once of static obstacles."""
         key = first.tobytes() + last.tobytes()
         if not self._clear_of_static.get(key, True) or not clear.edges_of_dynamic(first[None], last[None])[0]:
             return False
@@ -110,7 +110,7 @@ class DamonReplanner:
         return self._clear_of_static[key]
 
     def _free_of_static(self, context: RunContext, states: Array, budget: ComputeBudget) -> Flags:
-        """Return which nodes are inside the limits, and free of what stands still and of the robot, shape (N,)."""
+        """Return which nodes are inside the limits, and free of static obstacles and of the robot, shape (N,)."""
         key = states[0, context.fingers].tobytes()  # the other joints of nodes are always the same
         if key not in self._usable:
             limits = context.setup.robot.limits

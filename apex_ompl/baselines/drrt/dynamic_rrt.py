@@ -19,7 +19,7 @@ class GoalTree:
     """A rapidly exploring random tree rooted at goals."""
 
     def __init__(self, goals: Array, step: float, most: int | None = None) -> None:
-        """Begin with the roots alone.
+        """Start with the roots alone.
 
         Args:
             goals: Shape (goals, dof).
@@ -55,7 +55,7 @@ class GoalTree:
 
     @property
     def edges(self) -> tuple[Array, Array]:
-        """States of the parents of all nodes behind the roots, and of the nodes, each of shape (N - roots, dof)."""
+        """States of the parents of all nodes after the roots, and of the nodes, each of shape (N - roots, dof)."""
         return self.states[self.parents[self.roots :]], self.states[self.roots :]
 
     def at(self, q: Array) -> int:
@@ -90,7 +90,7 @@ class GoalTree:
         self._squares = np.concatenate([self._squares, np.empty_like(self._squares)])
 
     def trim(self, free: AreFree) -> int:
-        """Remove the nodes whose edges are no longer free, and all behind them; return their number."""
+        """Remove the nodes whose edges are no longer free, and all after them; return their number."""
         kept = np.ones(self._count, bool)
         kept[self.roots :] = free(*self.edges)
         for k in range(self.roots, self._count):
@@ -115,20 +115,20 @@ class DynamicRRT:
     """Dynamic RRT (Ferguson, Kalra and Stentz 2006, "Replanning with RRTs"; Connell and La 2017 compare with it).
 
     The tree is rooted at the goals, so that it stays of use while the robot moves. Before it is grown again, edges that
-    are no longer free are removed with all behind them. It grows until it has a start: towards a start, towards states
+    are no longer free are removed with all after them. It grows until it has a start: towards a start, towards states
     of the last path (the way-point cache of Bruce and Veloso 2002, "Real-time randomized path planning for robot
     navigation"), or towards random states. Without a last path these take the place of way-points, and what is left is
     RRT from the goal.
 
     The paper leaves open how long steps are, the distance (here Euclidean, steps by the largest change of a joint), how
     many way-points are kept (here the nodes of the last path), several goals (here roots alike), and a tree that is
-    long kept (here it may be bounded, and then begins anew).
+    long kept (here it may be bounded, and then starts anew).
 
     Attributes:
         step: Largest length of an edge [rad, max-norm].
         to_start: Share of the extensions towards a start.
         to_waypoint: Share of those towards states of the last path.
-        most: Number of nodes from which on the tree begins anew; None for any number.
+        most: Number of nodes from which on the tree starts anew; None for any number.
         tree: The tree, or None.
         waypoints: Nodes of the last path, shape (L, dof), or None.
     """

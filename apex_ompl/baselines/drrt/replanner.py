@@ -27,8 +27,8 @@ SEEN = 0.01  # clearances beyond this are not told apart [m]
 class DynamicRRTReplanner:
     """The planner ``drrt`` in the loop: :class:`apex_ompl.baselines.drrt.dynamic_rrt.DynamicRRT`, kept over a run.
 
-    At each replan, nodes whose edges meet an obstacle where it stands when the new motion begins are removed with all
-    behind them, and the tree grows until it reaches the robot. Its path is made shorter between its nodes, timed, and
+    At each replan, nodes whose edges meet an obstacle where it stands when the new motion starts are removed with all
+    after them, and the tree grows until it reaches the robot. Its path is made shorter between its nodes, timed, and
     proved among the obstacles as they are predicted.
 
     It plans from rest: while the robot will be moving at the time of joining it answers nothing. Two sets
@@ -89,7 +89,7 @@ def timed(search: Search, path: Array, clear: Clearances) -> Trajectory | None:
 
 @dataclass(frozen=True, eq=False)
 class Clearances:
-    """Which states are clear of what stands still, of the robot itself, and of obstacles where they are at joining.
+    """Which states are clear of static obstacles, of the robot itself, and of obstacles where they are at joining.
 
     Attributes:
         search: The replan.
@@ -104,7 +104,7 @@ class Clearances:
         return clear
 
     def of_static(self, states: Array) -> Flags:
-        """Return whether each state, shape (N, dof), is clear of what stands still, and of the robot itself."""
+        """Return whether each state, shape (N, dof), is clear of static obstacles, and of the robot itself."""
         context = self.search.context
         own = context.kernel.clearance(states, SEEN).min(axis=1)
         self.search.budget.spend("near clearance", len(states))
@@ -119,7 +119,7 @@ class Clearances:
         return self._along(first, last, self)
 
     def line(self, first: Array, last: Array) -> bool:
-        """Whether a straight motion is proved clear of what stands still, and looked at in steps, of obstacles."""
+        """Whether a straight motion is proved clear of static obstacles, and looked at in steps, of obstacles."""
         seen = self.edges_of_dynamic(first[None], last[None])[0]
         return bool(seen) and self.search.context.line_is_clear(first, last, self.search.budget)
 

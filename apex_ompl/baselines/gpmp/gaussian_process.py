@@ -76,16 +76,16 @@ class GaussianProcess:
         return np.array([[12.0 / t**3, -6.0 / t**2], [-6.0 / t**2, 4.0 / t]]) / self.power
 
     def interpolation(self, time: float) -> tuple[Array, Array]:
-        """Return Lambda(t) and Psi(t), shape (2, 2) each, of a time behind a support [s]."""
+        """Return Lambda(t) and Psi(t), shape (2, 2) each, of a time after a support [s]."""
         psi = self.covariance(time) @ self.transition(self.spacing - time).T @ self.precision
         return self.transition(time) - psi @ self.transition(self.spacing), psi
 
     def weights(self, count: int) -> Array:
-        """Return the weights of ``count`` states of an interval, its first support and evenly spaced ones behind it.
+        """Return the weights of ``count`` states of an interval, its first support and evenly spaced ones after it.
 
         Returns:
             Shape (count, 2, 2, 2): of a state; whether of its position or velocity; of the support before it or the one
-            behind it; whether of the position or the velocity there.
+            after it; whether of the position or the velocity there.
         """
         pairs = [self.interpolation(self.spacing * k / count) for k in range(count)]
         return np.stack([np.stack(pair, axis=1) for pair in pairs])

@@ -64,7 +64,7 @@ class Optimum(NamedTuple):
     Attributes:
         supports: Positions and velocities, shape (N + 1, 2, dof).
         evaluation: Their cost.
-        first_cost: Cost of where it began.
+        first_cost: Cost of where it started.
         iterations: Number of steps taken.
         evaluations: Number of motions whose cost was computed.
         converged: Whether the cost fell by less than the tolerance in the end.
@@ -187,11 +187,11 @@ class FactorGraph(Factors):
     ) -> Optimum:  # fmt: skip
         """Return the maximum of the posterior that Levenberg-Marquardt steps find.
 
-        The damping, a share of the diagonal, falls to a tenth behind a step that lowers the cost, and grows tenfold
+        The damping, a share of the diagonal, falls to a tenth after a step that lowers the cost, and grows tenfold
         behind one that does not.
 
         Args:
-            supports: Where to begin, shape (N + 1, 2, dof).
+            supports: Where to start, shape (N + 1, 2, dof).
             iterations: Most motions that are tried.
             tolerance: A step that lowers the cost by less than this share is the last.
             damping: Damping of the first step.
@@ -264,11 +264,11 @@ class CostFunctional(Factors):
         """Return what steps along the functional gradient come to.
 
         Args:
-            supports: Where to begin, shape (N + 1, 2, dof).
+            supports: Where to start, shape (N + 1, 2, dof).
             iterations: Most motions that are tried.
             tolerance: A step that lowers the cost by less than this share is the last.
             rate: Length 1 / eta of a step, as a multiple of the functional gradient; halved while the cost grows, and
-                doubled behind a step up to this.
+                doubled after a step up to this.
             largest: Largest change of a position in a step [rad].
             accepts: Asked about each motion whether it is good enough already.
             stop: Asked before each step whether to end.

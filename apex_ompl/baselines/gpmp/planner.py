@@ -152,7 +152,7 @@ class GPMP2(GaussianProcessParameters):
     """Maximum a posteriori on a Gaussian-process prior, a factor graph (Dong, Mukadam, Dellaert and Boots, RSS 2016).
 
     The longer account is Mukadam, Dong, Yan, Dellaert and Boots, "Continuous-time Gaussian process motion planning via
-    probabilistic inference", IJRR 2018. Levenberg-Marquardt steps, whose normal equations are block-tridiagonal, begin
+    probabilistic inference", IJRR 2018. Levenberg-Marquardt steps, whose normal equations are block-tridiagonal, start
     at the straight line at constant velocity, and go on until they converge; what comes out is a solution if the whole
     path is proved free.
 
@@ -183,7 +183,7 @@ class GPMP2(GaussianProcessParameters):
 class GaussianProcessPlanner(OwnPlanner):
     """OMPL planner GPMP or GPMP2: one initial motion after the other is optimized, until one is proved free.
 
-    A local method: it ends without a solution when it has nothing left to begin from, and says what is in the way.
+    A local method: it ends without a solution when it has nothing left to start from, and says what is in the way.
 
     Attributes:
         parameters: Its parameters.

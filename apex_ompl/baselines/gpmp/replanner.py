@@ -30,15 +30,15 @@ SLOWER = 1.01  # factor on the duration of a motion that exceeds its limits, bey
 class IncrementalGPMP2:
     """GPMP2 anew at each replan, from where the last one ended, as iGPMP2 does (Mukadam et al., IJRR 2018).
 
-    The first support is the state that the robot will have when the new motion begins, with its velocity; the last one
-    is a goal, at rest. Levenberg-Marquardt steps begin at the rest of the last motion to a goal, and then at straight
-    lines to the nearest goals. Obstacles that move are looked at where they will be at the time of each state.
+    The first support is the state that the robot will have when the new motion starts, with its velocity; the last one
+    is a goal, at rest. Levenberg-Marquardt steps start at the rest of the last motion to a goal, and then at straight
+    lines to the nearest goals. Dynamic obstacles are looked at where they will be at the time of each state.
 
     What the papers leave open, or is done otherwise: iGPMP2 updates one Bayes tree (iSAM2), here the few steps of a
     replan solve the whole block-tridiagonal system, which is small. Its duration is fixed; here it is that of the
-    motion to begin from without obstacles, times each of ``factors``, and longer where limits ask for it, with
+    motion to start from without obstacles, times each of ``factors``, and longer where limits ask for it, with
     obstacles at their new times then. Its states know no acceleration; the motion that is followed is the cubic
-    B-spline in time whose control points are states of the solution: it begins as the robot moves, keeps the limits,
+    B-spline in time whose control points are states of the solution: it starts as the robot moves, keeps the limits,
     and is proved. The prior's power is that of the planner ``gpmp2`` over the duration cubed.
 
     Attributes:
@@ -72,7 +72,7 @@ class IncrementalGPMP2:
         return Answer(None, "", budget)
 
     def guesses(self, search: Search) -> Iterator[tuple[str, Guess]]:
-        """Yield motions to begin from, and what they are."""
+        """Yield motions to start from, and what they are."""
         limits, rest = search.context.limits, rest_of_route(search)
         if rest is not None:
             yield "route", Guess(rest, rest[-1], least_duration(rest, limits))
@@ -104,7 +104,7 @@ class IncrementalGPMP2:
         return None
 
     def supports(self, search: Search, guess: Guess, duration: float) -> Array:
-        """Return supports to begin from, shape (N + 1, 2, dof)."""
+        """Return supports to start from, shape (N + 1, 2, dof)."""
         count = self.parameters.intervals + 1
         wanted, at = np.linspace(0.0, len(guess.states) - 1.0, count), np.arange(len(guess.states))
         positions = np.stack([np.interp(wanted, at, column) for column in guess.states.T], axis=1)
@@ -139,7 +139,7 @@ class IncrementalGPMP2:
 class IncrementalGPMP(IncrementalGPMP2):
     """GPMP in the same way: steps along the functional gradient, up to the first motion that is clear at its states.
 
-    The paper (Mukadam, Yan and Boots, ICRA 2016) plans once; that it is begun anew from the moving robot and where the
+    The paper (Mukadam, Yan and Boots, ICRA 2016) plans once; that it is started anew from the moving robot and where the
     last motion ended, is as in :class:`IncrementalGPMP2`. With 10, 20 or 40 iterations, and tolerances of 1e-3 or
     1e-2, it fails in 2 of 16 validation worlds.
     """
@@ -168,7 +168,7 @@ def spline_of(problem: Factors, supports: Array, start: Start) -> TimedSpline:
     """Return the cubic B-spline in time near a motion, from what the robot does to rest where the motion ends.
 
     A control point is about where the robot is a knot spacing before its own number of spacings: they are states of the
-    motion. The end, and a begin at rest, take a knot spacing longer.
+    motion. The end, and a start at rest, take a knot spacing longer.
     """
     count = max(round(problem.process.spacing / KNOT_SPACING), 1)
     states = problem.process.states(supports, count)[:, 0]

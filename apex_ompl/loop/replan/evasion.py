@@ -27,7 +27,7 @@ def endangered(following: Following, at: float, conflict: float, within: float =
 
     Args:
         following: What the robot follows.
-        at: Time of the clock [s].
+        at: Clock time [s].
         conflict: That of the first contact that is predicted of what it follows [s], infinite without one.
         within: The time from ``at`` on [s].
     """
@@ -42,8 +42,8 @@ def threatened(following: Following, at: float, conflict: float) -> bool:
 def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
     """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None.
 
-    One that begins while the robot moves is the fastest to that state. Besides states around, the robot may go back: to
-    states of its last motion to a goal, and to where it began. Where
+    One that starts while the robot moves is the fastest to that state. Besides states around, the robot may go back: to
+    states of its last motion to a goal, and to where it started. Where
     motions aside are to be proved clear of all that obstacles can reach, the states are clear of that at the arrival
     where possible, and motions that are proved come first; another one may still have a fail-safe stop at each of its
     steps.
@@ -108,7 +108,7 @@ def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
     Args:
         search: The replan.
         states: Shape (N, dof).
-        looks: Times of the clock, shape (T,) [s].
+        looks: Clock times, shape (T,) [s].
 
     Returns:
         Clearances, shape (N, T) or (N, T + 1), and gradients, shape (N, T or T + 1, dof).

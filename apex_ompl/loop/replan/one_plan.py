@@ -92,7 +92,7 @@ RRTCONNECT = "rrtconnect"
 
 @contextmanager
 def spending(validator: MotionValidator, context: RunContext, budget: ComputeBudget, proved: bool) -> Iterator[None]:
-    """While the block runs, charge every motion that is checked, and prove it clear of what stands still if asked."""
+    """While the block runs, charge every motion that is checked, and prove it clear of static obstacles if asked."""
     check = validator.check
 
     def counted(first: Array, second: Array) -> bool:
@@ -112,7 +112,7 @@ class RRTConnectFromRest:
 
     What it finds is followed if it is proved among obstacles as they are predicted. As if they stood is no better: of
     24 worlds ``moving`` of the validation split, at a quarter of the velocity limits, 12 are solved as it is, 11 so.
-    Where a motion is not proved clear of what stands still, a path is looked for whose straight motions are.
+    Where a motion is not proved clear of static obstacles, a path is looked for whose straight motions are.
     """
 
     _setup: PlanningSetup | None = field(default=None, repr=False)
@@ -138,7 +138,7 @@ class RRTConnectFromRest:
 
         Args:
             search: The replan.
-            proved: Whether each straight motion is proved clear of what stands still; else it is looked at in steps.
+            proved: Whether each straight motion is proved clear of static obstacles; else it is looked at in steps.
         """
         assert self._setup is not None
         setup = self._setup

@@ -22,7 +22,7 @@ from apex_ompl.types import Array
 FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
 GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
-ASIDE = 0.7  # share of the budget that other parts have where it may step aside behind them
+ASIDE = 0.7  # share of the budget that other parts have where it may step aside after them
 WAITING = 0.85  # and where a robot that stands may go nearer to a goal
 CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
@@ -33,7 +33,7 @@ class Portfolio:
     """Retiming, and a pool of motions in space and time from several sources; what arrives first is taken.
 
     Candidates of a replan that failed are carried over to the next one of the same run. Where only a faster motion is
-    of use, none are, and each replan begins with another source.
+    of use, none are, and each replan starts with another source.
 
     Attributes:
         sources: Where motions to start from come from, those that gain most for their time first.
@@ -206,7 +206,7 @@ LIMIT_SHARE = 0.98  # of the limits that speeds and accelerations between pieces
 
 
 def faster_motions(search: Search, motion: Trajectory) -> Iterator[Trajectory]:
-    """Yield faster motions through states of a motion, which begins when the robot joins it and ends at rest.
+    """Yield faster motions through states of a motion, which starts when the robot joins it and ends at rest.
 
     Each is in a few pieces, the fastest between their states by Ruckig (Berscheid and Kroeger 2021). Splines cannot
     change their acceleration as quickly as the limits of jerk allow.

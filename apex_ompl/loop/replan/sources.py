@@ -93,7 +93,7 @@ class Lines:
 class Proposals:
     """Paths of a latent diffusion model from the state that the robot will be in.
 
-    The model was trained among obstacles that stand still. It is shown each obstacle that moves where it comes nearest
+    The model was trained among obstacles that stand still. It is shown each dynamic obstacle where it comes nearest
     to the straight line in time.
 
     Attributes:
@@ -190,8 +190,8 @@ WORK = "state of a tree"
 class Sprint:
     """RRT-Connect in compiled code, for a robot that stands, from the second replan of a run on.
 
-    Its paths are longer than those that other sources begin from, so that they are no way to begin a run.
-    Each obstacle that moves stands where it comes nearest to the straight line in time; where it will touch the robot
+    Its paths are longer than those that other sources start from, so that they are no way to start a run.
+    Each dynamic obstacle stands where it comes nearest to the straight line in time; where it will touch the robot
     at the start of the search, there is none.
 
     Attributes:
