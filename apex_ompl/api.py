@@ -132,8 +132,8 @@ def run(
 ) -> RunResult:
     """Let a robot go to a goal while obstacles move.
 
-    The robot observes obstacles by a sensor, tracks them, follows a motion only as long as a stop after its next step is
-    proved clear of the reachable sets of all obstacles, and replans where its motion meets the prediction.
+    The robot observes obstacles by a sensor and tracks them. It follows a motion only as long as a stop after its next
+    step is proved clear of the reachable sets of all obstacles, and replans where its motion meets the prediction.
 
     Args:
         problem: A world by its name (:func:`apex_ompl.problems.worlds.load`), a problem some of whose obstacles move,

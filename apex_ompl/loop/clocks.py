@@ -107,8 +107,8 @@ def run_in_real_time(
     """Run the loop by the wall clock until the robot is at rest at a goal, or the time is up.
 
     A step is decided in the period before it, by the observations before that period. A driver holds the motion until
-    the next step and the proved stop after it. So where a step was not decided in time, the robot follows that stop, and
-    the decision is undone. The clock is paused while the environment reacts to the first motion.
+    the next step and the proved stop after it. So where a step was not decided in time, the robot follows that stop,
+    and the decision is undone. The clock is paused while the environment reacts to the first motion.
 
     Args:
         environment: What truly happens.

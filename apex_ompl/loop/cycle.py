@@ -22,6 +22,15 @@ from apex_ompl.scene.scripts import obstacle_at, vector
 from apex_ompl.timing import Trajectory
 
 LONGEST_STOP = 5.0  # after which a run ends whose robot does not come to rest when the time is up [s]
+DECISIONS = (
+    "route", "leaving", "aside", "departure", "nearest", "ending", "conflict", "contact", "conflict_since", "ahead",
+    "doing", "braking",
+)  # fmt: skip
+"""Attributes of an executor that are decided together with what it follows."""
+TAKEN = {"accepted": "rejected", "improved": "kept"}
+"""Kinds of events of answers that were taken, and of answers that were not."""
+UNDONE = ("stop", "reaction", "conflict")
+"""Kinds of events that are removed with a step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,23 +209,12 @@ class Loop:
 
 
 def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float) -> bool:
-    """Whether an obstacle is where the assumptions of the guarantee exclude it: unseen, or outside its reachable set."""
+    """Whether an obstacle violates the assumptions of the guarantee: unseen, or outside its reachable set."""
     for o in present:
         known = [track for track in (*tracker.tracks.values(), *tracker.doubted) if track.shape.name == o.name]
         if not any(tracker.may_be(track, o, now, errors=1) for track in known):
             return True
     return False
-
-
-DECISIONS = (
-    "route", "leaving", "aside", "departure", "nearest", "ending", "conflict", "contact", "conflict_since", "ahead",
-    "doing", "braking",
-)  # fmt: skip
-"""Attributes of an executor that are decided together with what it follows."""
-TAKEN = {"accepted": "rejected", "improved": "kept"}
-"""Kinds of events of answers that were taken, and of answers that were not."""
-UNDONE = ("stop", "reaction", "conflict")
-"""Kinds of events that are removed with a step."""
 
 
 @dataclass(frozen=True, eq=False)

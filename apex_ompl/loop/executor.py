@@ -3,8 +3,8 @@
 At every step the robot continues only where the next step and a stop after it are proved clear of the reachable sets of
 all obstacles; else it follows the stop that was proved one step before. By induction it is at rest whenever it is
 touched, as long as no obstacle is faster than assumed, and each was seen, within the assumed error, before the stop was
-proved. A robot at rest that is about to be touched may step aside along a motion that is proved in the same way until it
-is at rest again; that motion then is the fail-safe stop itself. Only where the user chooses so (``evade="risk"``) it
+proved. A robot at rest that is about to be touched may step aside along a motion that is proved in the same way until
+it is at rest again; that motion then is the fail-safe stop itself. Only where the user chooses so (``evade="risk"``) it
 leaves without a fail-safe stop; those steps are counted. (Fail-safe maneuvers verified online: Althoff and Dolan 2014;
 Pereira and Althoff 2015.)
 """
@@ -32,7 +32,9 @@ from apex_ompl.types import Array
 BLIND_TIME = 0.15  # time that an obstacle may move unseen before the robot is at rest [s]
 SHORTEST = 0.1  # remaining time of a motion below which no faster one is sought [s]
 NEAR = 0.5  # time before a conflict below which the robot brakes where no answer comes at once [s]
-NEARER = 0.01  # by how much nearer than at the start of a motion an obstacle must come, within the trigger, to stop it [m]
+NEARER = (
+    0.01  # by how much nearer than at the start of a motion an obstacle must come, within the trigger, to stop it [m]
+)
 
 
 @dataclass(eq=False)
@@ -45,7 +47,7 @@ class Executor:
         tracker: Estimates of the obstacles.
         seed: Seed of random choices.
         following: The motion that the robot follows.
-        stop: The fail-safe stop: it is proved from the next step on until the robot is at rest, or from now on where the
+        stop: The fail-safe stop: proved from the next step on until the robot is at rest, or from now on where the
             robot follows it; None for a robot at rest, or one that leaves without.
         followed: The motions that were followed, and from which times on.
         events: What happened.
@@ -55,7 +57,7 @@ class Executor:
         conflict: Time of the first predicted conflict of the motion [s], or infinity.
         contact: The same without margins for uncertainty, where the robot will be at rest soon; else infinity.
         unguarded: Number of steps at which the robot moved without a fail-safe stop.
-        conflict_since: Time of the first prediction of a conflict to which the command has not changed yet [s], or None.
+        conflict_since: Time of the first prediction of a conflict until the command changes [s], or None.
         nearest: Distance of an obstacle below which the motion counts as blocked, where distance decides [m].
         closed: Whether the time is up: no motion is requested or taken any more.
         ending: Whether the robot follows the stop that ends the run.

@@ -1,4 +1,4 @@
-"""Who answers the executor's requests: a replanner at once on the simulated clock, or a planner process in real time."""
+"""Who answers the executor's requests: a replanner at once, on the simulated clock, or a planner process."""
 
 from __future__ import annotations
 
@@ -105,7 +105,6 @@ class ImmediateReplanning:
     def faults(self) -> tuple[str, ...]:
         """There are none."""
         return ()
-
 
 
 @dataclass(frozen=True, eq=False)

@@ -85,10 +85,10 @@ class SensorStream:
     """The observations of one environment by a sensor, in order, each returned once."""
 
     def __init__(self, sensor: Sensor, environment: Environment, watched: float = 0.0) -> None:
-        """Start with the look at time 0, or some time before [s].
+        """Start with the observation at time 0, or some time before [s].
 
         Raises:
-            ParameterError: That time is not from 0 to an hour, or to that of a million looks.
+            ParameterError: That time is not from 0 to an hour, or to that of a million observations.
         """
         check_number(watched, "watched", 0.0, min(LONGEST, EARLIEST / sensor.rate))
         self.sensor, self._environment = sensor, environment

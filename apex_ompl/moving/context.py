@@ -25,6 +25,7 @@ from apex_ompl.timing.trajectory import concatenate
 from apex_ompl.types import Array
 
 SAME_TIME = 1e-9  # [s]
+GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +98,6 @@ def executed(followed: list[tuple[float, Following]], end: float) -> Trajectory:
         one.piece(start, until) for (start, one), until in zip(followed, ends, strict=True) if until > start + SAME_TIME
     ]
     return concatenate(pieces) if pieces else followed[-1][1].motion
-
-
-GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
 
 
 @dataclass(eq=False)
@@ -262,8 +260,8 @@ class RunContext:
         settings = self.settings
         error, fastest = settings.assumed
         count, by_joints = stops_proved(
-            self.kernel, predicted, following.motion, self.stopping, moments - following.start_time, clock=following.start_time,
-            age=age, growth=(error + spread, fastest), period=settings.period,
+            self.kernel, predicted, following.motion, self.stopping, moments - following.start_time,
+            clock=following.start_time, age=age, growth=(error + spread, fastest), period=settings.period,
         )  # fmt: skip
         left = np.flatnonzero(by_joints[:count])
         for done, k in enumerate(left):

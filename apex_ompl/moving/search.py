@@ -34,6 +34,7 @@ NARROW = 1.0  # time that a motion that the guard may stop must gain over one th
 GOOD = 1.2  # duration of a motion with which a replan ends, as a multiple of the direct one's
 ENOUGH_TIME = 0.2  # share of the budget after which it ends with any motion that has room
 BETTER = 0.97  # share of the duration of the best motion so far below which another one is worth its while
+LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
 
 
 @dataclass(eq=False)
@@ -246,9 +247,6 @@ def least_duration(states: Array, limits: Limits) -> float:
     way = np.abs(np.diff(states, axis=0)).sum(axis=0)
     distance = np.abs(states[-1] - states[0]) / limits.acceleration
     return float(max((way / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))
-
-
-LOOKS = 16  # at the straight line, to see where an obstacle comes nearest
 
 
 def fresh_checker(context: RunContext) -> CollisionChecker:

@@ -16,9 +16,9 @@ EVADE = ("never", "proved", "risk")
 
 RANGES = {
     "watched": (0.0, 60.0), "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0),
-    "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "clearance_margin": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0),
-    "trigger": (0.0, 1.0), "timeout": (0.1, 600.0), "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
-    "memory": (0.1, 600.0), "silence": (0.01, 60.0),
+    "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "clearance_margin": (0.0, 0.5), "error": (0.0, 0.5),
+    "fastest": (0.0, 5.0), "trigger": (0.0, 1.0), "timeout": (0.1, 600.0), "stuck": (0.1, 600.0),
+    "latency": (-1.0, 10.0), "memory": (0.1, 600.0), "silence": (0.01, 60.0),
 }  # fmt: skip
 
 

@@ -24,6 +24,9 @@ from apex_ompl.util.validation import check_states, check_times, number_array
 
 SLICE, SHORTEST_SLICE = 0.02, 0.00125  # of time, in which exact shapes are looked at [s]
 INFLATED = ("box", "sphere", "cylinder", "capsule")
+SHORTEST_STEP = 0.01  # time between two states of a path [s]
+MAX_INTERVALS = 1_000_000
+OBSTACLE_STEP = 0.005  # largest motion of an obstacle during one time interval of the check [m]
 
 
 @dataclass(frozen=True)
@@ -135,11 +138,6 @@ class TimedProver:
             pairs = [pair for pair in self._allowed if not any(map(self._checker.is_obstacle, pair))]
             self._exact[length] = CollisionChecker(self._checker.robot, swept, self._checker.held.values(), pairs)
         return self._exact[length]
-
-
-SHORTEST_STEP = 0.01  # time between two states of a path [s]
-MAX_INTERVALS = 1_000_000
-OBSTACLE_STEP = 0.005  # largest motion of an obstacle during one time interval of the check [m]
 
 
 @dataclass(frozen=True)

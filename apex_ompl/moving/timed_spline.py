@@ -27,6 +27,14 @@ KNOT_SPACING = 0.1  # that is aimed at [s]
 LEAST_SPANS, MOST_SPANS = 8, 40
 ROUNDS = 4  # of steps, between which a motion over its limits gets more time
 SLOWER = 1.02  # least factor on its duration then
+ROUND, MOST_ROUNDS = 4, 8  # optimizer steps in a round, and rounds that a candidate has at most
+PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
+CLEAR = -0.003  # clearance at the samples from which on a proof is tried; spheres protrude [m]
+ENOUGH = 0.03  # at which a round ends early [m]
+REFIT = 64  # states of a candidate that starts from elsewhere
+FASTER = 0.9  # factor on the duration of a motion that is found, from which a faster one is looked for
+LONGEST = 60.0  # duration at which a candidate is of no use [s]
+LEAST = 1e-6  # clearance cost that counts as none
 
 
 @dataclass(frozen=True)
@@ -274,16 +282,6 @@ def _basis(x: Array) -> Array:
 def _slopes(x: Array) -> Array:
     """Return the derivatives of :func:`_basis` with respect to the share, shape (N, 4)."""
     return np.stack([-((1 - x) ** 2), 3 * x**2 - 4 * x, -3 * x**2 + 2 * x + 1, x**2], axis=1) / 2.0
-
-
-ROUND, MOST_ROUNDS = 4, 8  # optimizer steps in a round, and rounds that a candidate has at most
-PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
-CLEAR = -0.003  # clearance at the samples from which on a proof is tried; spheres protrude [m]
-ENOUGH = 0.03  # at which a round ends early [m]
-REFIT = 64  # states of a candidate that starts from elsewhere
-FASTER = 0.9  # factor on the duration of a motion that is found, from which a faster one is looked for
-LONGEST = 60.0  # duration at which a candidate is of no use [s]
-LEAST = 1e-6  # clearance cost that counts as none
 
 
 @dataclass(eq=False)

@@ -15,6 +15,7 @@ from apex_ompl.types import Array, Flags, Indices
 POOL = 5  # times as many nodes are nearest in the latent space as are joined: those of them nearest in joint space
 SPACING = 0.05  # of the states at which edges are checked for self-collision [rad, max-norm]
 BLOCK = 512  # nodes whose distances are computed at once
+WIDER = 3  # factor on the number of connections where they lead to no path
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,9 +147,6 @@ def chosen_nodes(sample: StateSample, autoencoder: StateAutoencoder, count: int)
     """Return states of a sample that are spread evenly over the latent space, in the order of the sample, (count,)."""
     latent = autoencoder.encode(sample.states)
     return np.sort(farthest_points(latent, min(count, len(latent))))
-
-
-WIDER = 3  # factor on the number of connections where they lead to no path
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,9 @@ from apex_ompl.baselines.drrt.dynamic_rrt import AreFree
 from apex_ompl.kernel.compiled.graph_search import shortest_path
 from apex_ompl.types import Array, Flags, Indices
 
+Motion = tuple[str, int, int]
+"""A motion of a search: ``start`` or ``goal``, its number, and a node; or ``edge``, its number, and its twin's."""
+
 
 @dataclass(frozen=True, eq=False)
 class Graph:
@@ -60,10 +63,6 @@ class _Found(NamedTuple):
     nodes: list[int]
     edges: list[int]
     goal: int
-
-
-Motion = tuple[str, int, int]
-"""A motion of a search: ``start`` or ``goal``, its number, and a node; or ``edge``, its number, and its twin's."""
 
 
 class LazySearch:
@@ -158,8 +157,8 @@ class LazySearch:
         self.searches += 1
         graph, (cost, parent, keys, heap) = self.graph, self._buffers
         node = int(shortest_path(
-            graph.first_edges, graph.ends, graph.lengths, self._usable, self._entry.min(axis=0), self._leave.min(axis=0),
-            self._heuristic, cost, parent, keys, heap,
+            graph.first_edges, graph.ends, graph.lengths, self._usable, self._entry.min(axis=0),
+            self._leave.min(axis=0), self._heuristic, cost, parent, keys, heap,
         ))  # fmt: skip
         if node < 0:
             return None

@@ -27,6 +27,11 @@ from apex_ompl.util.schema import StrictModel, read_json, validate
 
 LAYERS = ("encoder.0", "encoder.2", "encoder.4", "decoder.0", "decoder.2", "decoder.4")
 """Names of the dense layers, as those of :class:`apex_ompl.baselines.damon.manifold_training.StateNetwork`."""
+SCHEMA = "apex-ompl/manifold/1"
+CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+MADE_BY = "python scripts/train_damon.py"
+DECODED, STORED = "decoded", "stored"
+MOST_NODES = 65_535  # edges are stored in 16 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,13 +81,6 @@ def weight_shapes(joints: int, hidden: int, dim: int) -> dict[str, tuple[int, ..
     for name, (before, after) in zip(LAYERS, sizes, strict=True):
         found |= {f"{name}.weight": (after, before), f"{name}.bias": (after,)}
     return found
-
-
-SCHEMA = "apex-ompl/manifold/1"
-CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
-MADE_BY = "python scripts/train_damon.py"
-DECODED, STORED = "decoded", "stored"
-MOST_NODES = 65_535  # edges are stored in 16 bits
 
 
 class ManifoldConfig(StrictModel):

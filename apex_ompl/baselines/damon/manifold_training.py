@@ -14,6 +14,7 @@ from apex_ompl.training.records import Paths
 from apex_ompl.types import Array, Indices
 
 RATE, BATCH = 2e-3, 1024
+HELD_OUT = 50  # one path of so many is left out of training
 
 
 class StateNetwork(nn.Module):
@@ -86,9 +87,6 @@ def train(
             total += float(loss.detach()) * len(which)
         progress(epoch, total / len(x))
     return {name: value.detach().numpy().copy() for name, value in network.state_dict().items()}
-
-
-HELD_OUT = 50  # one path of so many is left out of training
 
 
 def sample_states(paths: Paths, joints: Indices, count: int, along: int, seed: int) -> StateSample:

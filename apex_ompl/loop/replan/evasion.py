@@ -20,6 +20,9 @@ DURATION = 0.35  # about how long a step aside takes [s]
 GAIN = 0.2  # time that a step aside that is touched in the end must gain [s]
 BACK = 6  # states of the last motion to a goal, and the start of the run, that it may go to as well
 NEARNESS = 0.05  # clearance that a step shorter by 1 rad is worth [m]
+SHARES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.15)  # of the way to a goal, the nearest to it first
+NEAREST_GOALS = 2  # nearest goals to which that is tried
+LEAST_NEARER = 0.1  # distance that a robot comes nearer to a goal at least [rad]
 
 
 def endangered(following: Following, at: float, conflict: float, within: float = SOON) -> bool:
@@ -134,11 +137,6 @@ def _back(search: Search) -> Array:
     if route is None:
         return started
     return np.concatenate([started, route.motion(np.linspace(0.0, route.motion.duration, BACK))])
-
-
-SHARES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.15)  # of the way to a goal, the nearest to it first
-NEAREST_GOALS = 2  # nearest goals to which that is tried
-LEAST_NEARER = 0.1  # distance that a robot comes nearer to a goal at least [rad]
 
 
 def wait_nearer(search: Search) -> Trajectory | None:

@@ -31,6 +31,9 @@ from apex_ompl.planners.registry import parameters
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
 
+RRTCONNECT = "rrtconnect"
+NAME = "proposal"
+
 
 def timed(search: Search, states: Array) -> Trajectory | None:
     """Return a motion from rest to rest along states, shape (N, dof), or None where none is found."""
@@ -85,9 +88,6 @@ class StopAndWait:
             if made.trajectory is not None and search.accepts(made.trajectory):
                 search.take(made.trajectory, "retime")
         return Answer(search.best, search.part, budget)
-
-
-RRTCONNECT = "rrtconnect"
 
 
 @contextmanager
@@ -166,9 +166,6 @@ class RRTConnectFromRest:
             return None
         goal = min(goals, key=lambda goal: float(np.linalg.norm(goal - path[-1])))
         return np.concatenate([search.start.position[None], path[1:-1], goal[None]])
-
-
-NAME = "proposal"
 
 
 @dataclass(eq=False)

@@ -26,6 +26,8 @@ ASIDE = 0.7  # share of the budget that other parts have where it may step aside
 WAITING = 0.85  # and where a robot that stands may go nearer to a goal
 CARRIED = 6  # candidates that are carried over to the next replan
 SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
+TRIES = ((2, 1.25), (3, 1.25), (2, 1.0), (4, 1.1), (3, 1.0))  # numbers of pieces, and factors on the speed between them
+LIMIT_SHARE = 0.98  # of the limits that speeds and accelerations between pieces have at most
 
 
 @dataclass(eq=False)
@@ -199,10 +201,6 @@ def retimed(search: Search) -> Trajectory | None:
     )  # fmt: skip
     search.budget.spend("retiming")
     return made.trajectory if made.trajectory is not None and search.accepts(made.trajectory) else None
-
-
-TRIES = ((2, 1.25), (3, 1.25), (2, 1.0), (4, 1.1), (3, 1.0))  # numbers of pieces, and factors on the speed between them
-LIMIT_SHARE = 0.98  # of the limits that speeds and accelerations between pieces have at most
 
 
 def faster_motions(search: Search, motion: Trajectory) -> Iterator[Trajectory]:

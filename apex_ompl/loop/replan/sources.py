@@ -22,6 +22,8 @@ from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
 FASTER = (0.92, 0.8)  # shares of the duration of a motion in which a faster one is looked for
 TEMPERATURES = (1.0, 1.6)  # of the noise, in one replan after the other
+BATCH = 16  # random states between two looks at the charges
+WORK = "state of a tree"
 
 
 @dataclass(frozen=True)
@@ -180,10 +182,6 @@ class Renoised(Proposals):
         search.budget.spend("proposals")
         search.budget.spend("proposal", self.count)
         return made.control
-
-
-BATCH = 16  # random states between two looks at the charges
-WORK = "state of a tree"
 
 
 @dataclass(eq=False)
