@@ -32,9 +32,7 @@ from apex_ompl.types import Array
 BLIND_TIME = 0.15  # time that an obstacle may move unseen before the robot is at rest [s]
 SHORTEST = 0.1  # remaining time of a motion below which no faster one is sought [s]
 NEAR = 0.5  # time before a conflict below which the robot brakes where no answer comes at once [s]
-NEARER = (
-    0.01  # by how much nearer than at the start of a motion an obstacle must come, within the trigger, to stop it [m]
-)
+NEARER = 0.01  # by which an obstacle within the trigger must come nearer than at the start of a motion to stop it [m]
 
 
 @dataclass(eq=False)

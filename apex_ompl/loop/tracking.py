@@ -111,7 +111,7 @@ class Track:
 
 
 class Taken(NamedTuple):
-    """What came of an observation.
+    """How an observation was taken.
 
     Attributes:
         refused: Why it was refused as a whole, or nothing.

@@ -212,7 +212,7 @@ class Search:
         return MotionPool(optimizer, self.start, request.join, self.budget, self.accepts, clearance_margin=beyond)
 
 
-class Guess(NamedTuple):
+class InitialMotion(NamedTuple):
     """A motion to start from.
 
     Attributes:
@@ -238,11 +238,11 @@ class Source(Protocol):
     def prepare(self, context: RunContext) -> None:
         """Load what it needs, before a run."""
 
-    def guesses(self, search: Search) -> Iterator[Guess]:
+    def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield motions to start from, and charge what they cost."""
 
 
-def least_duration(states: Array, limits: Limits) -> float:
+def shortest_duration(states: Array, limits: Limits) -> float:
     """Return about how long a motion along states takes at least, shape (N, dof) [s]."""
     way = np.abs(np.diff(states, axis=0)).sum(axis=0)
     distance = np.abs(states[-1] - states[0]) / limits.acceleration
@@ -267,7 +267,7 @@ def place_nearest(checker: CollisionChecker, search: Search, goal: Array) -> Non
     """Let each obstacle stand where it is when one comes nearest to the straight motion to a goal, shape (dof,)."""
     request = search.request
     line = np.linspace(search.start.position, goal, LOOKS)
-    duration = least_duration(line, search.context.limits)
+    duration = shortest_duration(line, search.context.limits)
     times = request.join + np.linspace(0.0, duration, LOOKS)
     clear, _ = clearance_in_time(search.context.kernel, request.predicted, line, times)
     nearest = float(times[int(np.argmin(clear))])

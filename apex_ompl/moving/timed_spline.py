@@ -23,17 +23,17 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive
 
 PINNED = 3  # control points at each end that say where and how a motion starts and ends
-KNOT_SPACING = 0.1  # that is aimed at [s]
+KNOT_SPACING = 0.1  # aimed at [s]
 LEAST_SPANS, MOST_SPANS = 8, 40
-ROUNDS = 4  # of steps, between which a motion over its limits gets more time
+ROUNDS = 4  # rounds of steps of a repair, between which a motion over its limits gets more time
 SLOWER = 1.02  # least factor on its duration then
-ROUND, MOST_ROUNDS = 4, 8  # optimizer steps in a round, and rounds that a candidate has at most
+ROUND, MOST_ROUNDS = 4, 8  # optimizer steps in a round of a pool, and largest number of rounds of a candidate
 PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
-CLEAR = -0.003  # clearance at the samples from which on a proof is tried; spheres protrude [m]
-ENOUGH = 0.03  # at which a round ends early [m]
-REFIT = 64  # states of a candidate that starts from elsewhere
-FASTER = 0.9  # factor on the duration of a motion that is found, from which a faster one is looked for
-LONGEST = 60.0  # duration at which a candidate is of no use [s]
+CLEAR = -0.003  # clearance at the samples above which a proof is tried; spheres protrude [m]
+ENOUGH = 0.03  # clearance at which a round ends early [m]
+REFIT = 64  # states of a candidate that is refitted to another start
+FASTER = 0.9  # factor on the duration of a proved motion, from which a faster one is sought
+LONGEST = 60.0  # duration at which a candidate is dropped [s]
 LEAST = 1e-6  # clearance cost that counts as none
 
 
@@ -293,10 +293,10 @@ class MotionCandidate:
         goal: Where it ends, shape (dof,).
         origin: Name of what made it.
         cost: Part of its cost that is due to clearance.
-        clear: Whether a proof is worth its while: no sample is in contact.
-        damping: Of the next step.
+        clear: Whether a proof is tried: no sample is in contact.
+        damping: Damping of the next step.
         rounds: Number of rounds that it had.
-        given_up: Whether it is of no use any more.
+        given_up: Whether it is dropped.
     """
 
     spline: TimedSpline
@@ -315,7 +315,7 @@ class MotionCandidate:
 
 
 class MotionPool:
-    """Candidates for a motion from one start.
+    """Candidates for a motion from one start; the most promising one is improved next.
 
     Attributes:
         candidates: All candidates.
@@ -329,19 +329,19 @@ class MotionPool:
 
         Args:
             optimizer: Improves motions among the obstacles.
-            start: What the robot does when the motions start.
+            start: State of the robot when the motions start.
             clock: Clock time then [s].
-            budget: Gets the samples that are looked at.
+            budget: Counts the samples.
             accepts: The proof.
-            clearance_margin: How much nearer than the obstacles of the optimizer motions may come, of which a proof is tried [m].
+            clearance_margin: Margin of the optimizer's obstacles that a motion may lack when its proof is tried [m].
         """
-        self._optimizer, self._start, self._clock, self._charges = optimizer, start, clock, budget
+        self._optimizer, self._start, self._clock, self._budget = optimizer, start, clock, budget
         self._accepts, self._least = accepts, CLEAR - clearance_margin
         self.candidates: list[MotionCandidate] = []
         self._own: dict[bytes, float] = {}
 
     def add(self, states: Array, duration: float, goal: Array, origin: str) -> MotionCandidate:
-        """Take a motion in.
+        """Add a motion.
 
         Args:
             states: States evenly spaced in time, shape (N, dof).
@@ -356,9 +356,9 @@ class MotionPool:
         return one
 
     def carry(self, one: MotionCandidate, shift: float) -> None:
-        """Take a candidate of an earlier pool in, whose motion started some time before [s].
+        """Add a candidate of an earlier pool, whose motion was to start some time earlier [s].
 
-        It goes on as it is where the robot stands where it stood, and starts from where the robot is now else.
+        It is kept where the robot still is at rest at its start, and refitted to the robot's state otherwise.
         """
         old, now = one.spline.start, self._start
         resting = not (old.velocity.any() or now.velocity.any() or now.acceleration.any())
@@ -373,13 +373,13 @@ class MotionPool:
         self.add(rest, motion.duration - start, one.goal, one.origin)
 
     def improve(self, shorter: Callable[[], float], until: float = np.inf) -> tuple[MotionCandidate, Trajectory] | None:
-        """Improve candidates until one is proved, or time is up.
+        """Improve candidates until one is proved, or the time is up.
 
         Args:
-            shorter: Returns the duration that motions must be shorter than to be of use [s].
-            until: Time by the charges at which to pause [s].
+            shorter: Returns the duration that motions must be shorter than [s].
+            until: Time of the budget at which to pause [s].
         """
-        while not self._charges.over() and self._charges.spent < until:
+        while not self._budget.over() and self._budget.spent < until:
             open_ones = [
                 one
                 for one in self.candidates
@@ -402,7 +402,7 @@ class MotionPool:
                 continue
             motion = one.spline.trajectory(self._optimizer.kernel.robot.joint_names)
             if self._accepts(motion):
-                one.spline, one.rounds = one.spline.lasting(FASTER * one.spline.spacing), 0  # it is found; now faster
+                one.spline, one.rounds = one.spline.lasting(FASTER * one.spline.spacing), 0  # next, a faster one
                 self._improve(one, 0)
                 return one, motion
         return None
@@ -420,7 +420,7 @@ class MotionPool:
         one.spline, report = self._optimizer.improve(
             one.spline, clock=self._clock, steps=steps, enough=ENOUGH, damping=one.damping
         )
-        self._charges.spend("sample of a motion", self._optimizer.samples - before)
+        self._budget.spend("sample of a motion", self._optimizer.samples - before)
         one.cost = report.clearance_cost
         ends = self._own_clearance(one.goal)
         one.clear = report.scene_clearance >= self._least and report.own_clearance >= min(0.0, ends) + CLEAR

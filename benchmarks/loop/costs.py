@@ -186,9 +186,9 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     reflex = PotentialField()
     found["force"].append(seconds(lambda: reflex.controls(search, horizon)) / reflex.steps)
     factors = IncrementalGPMP2()
-    _, guess = next(factors.guesses(search))
-    graph = factors.problem(search, guess.duration)
-    started = factors.supports(search, guess, guess.duration)
+    _, initial = next(factors.initial_motions(search))
+    graph = factors.problem(search, initial.duration)
+    started = factors.supports(search, initial, initial.duration)
     count = graph.maximum(started, factors.iterations, 0.0).evaluations * len(graph.times)
     found[WORK].append(seconds(lambda: graph.maximum(started, factors.iterations, 0.0)) / count)
     step = DynamicRRTReplanner().search.step
@@ -249,8 +249,8 @@ def trees() -> dict[str, float]:
         sprint = Sprint()
         sprint.prepare(context)
         first = anew(search)
-        list(sprint.guesses(first))
-        sprinted += seconds(lambda one=sprint, of=search: list(one.guesses(anew(of))))
+        list(sprint.initial_motions(first))
+        sprinted += seconds(lambda one=sprint, of=search: list(one.initial_motions(anew(of))))
         states += first.budget.counts[SPRINT]
     return {"motion of a tree": spent / motions, SPRINT: sprinted / states}
 

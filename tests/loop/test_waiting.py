@@ -117,17 +117,17 @@ def test_trees_find_a_way_around_what_stands_still() -> None:
     context = context_of(BLOCKED)
     search, sprint = search_of(context, FAR), Sprint()
     sprint.prepare(context)
-    (guess,) = sprint.guesses(search)
-    assert np.abs(guess.states[0] - context.setup.start).max() < 1e-9
-    assert np.abs(guess.goal - guess.states[-1]).max() < 1e-9 and context.is_goal(guess.goal)
+    (initial,) = sprint.initial_motions(search)
+    assert np.abs(initial.states[0] - context.setup.start).max() < 1e-9
+    assert np.abs(initial.goal - initial.states[-1]).max() < 1e-9 and context.is_goal(initial.goal)
     assert search.budget.counts[WORK] > 100
-    line = np.linspace(context.setup.start, guess.goal, 200)
-    ends = np.concatenate([np.linspace(a, b, 20) for a, b in zip(guess.states, guess.states[1:], strict=False)])
+    line = np.linspace(context.setup.start, initial.goal, 200)
+    ends = np.concatenate([np.linspace(a, b, 20) for a, b in zip(initial.states, initial.states[1:], strict=False)])
     assert not context.checker.are_free(line).all()
     assert context.checker.are_free(ends).mean() > 0.97  # but for corners that even spacing cuts
     again = search_of(context, FAR)
-    (same,) = sprint.guesses(again)
-    assert np.array_equal(same.states, guess.states) and again.budget.counts == search.budget.counts
+    (same,) = sprint.initial_motions(again)
+    assert np.array_equal(same.states, initial.states) and again.budget.counts == search.budget.counts
 
 
 def test_trees_know_where_obstacles_will_be(context: RunContext) -> None:
@@ -137,11 +137,11 @@ def test_trees_know_where_obstacles_will_be(context: RunContext) -> None:
     sprint.prepare(context)
     middle = palm(context, 0.5 * (start + goal))
     coming = cube(middle + np.array([0.0, 0.0, 0.6]), velocity=(0.0, 0.0, -1.0))
-    (guess,) = sprint.guesses(search_of(context, coming))
-    assert np.abs(guess.states - np.linspace(start, guess.goal, len(guess.states))).max() > 0.05
-    assert not list(sprint.guesses(search_of(context, cube(palm(context, start)))))
+    (initial,) = sprint.initial_motions(search_of(context, coming))
+    assert np.abs(initial.states - np.linspace(start, initial.goal, len(initial.states))).max() > 0.05
+    assert not list(sprint.initial_motions(search_of(context, cube(palm(context, start)))))
     every = [cube(palm(context, one)).model_copy(update={"name": f"cube {k}"}) for k, one in enumerate(context.goals)]
-    assert not list(sprint.guesses(search_of(context, *every)))
+    assert not list(sprint.initial_motions(search_of(context, *every)))
 
 
 def test_trees_are_no_way_to_begin_a_run_or_to_go_on_from(context: RunContext) -> None:
@@ -151,8 +151,8 @@ def test_trees_are_no_way_to_begin_a_run_or_to_go_on_from(context: RunContext) -
     first = replace(search.request, number=1)
     moving = replace(search.request, following=replace(search.request.following, start_time=1.0))
     for request in (first, moving):
-        assert not list(sprint.guesses(Search(context, request, ComputeBudget(0.05))))
-    assert list(sprint.guesses(search))
+        assert not list(sprint.initial_motions(Search(context, request, ComputeBudget(0.05))))
+    assert list(sprint.initial_motions(search))
 
 
 def test_trees_stop_when_time_is_up() -> None:
@@ -160,7 +160,7 @@ def test_trees_stop_when_time_is_up() -> None:
     sprint = Sprint()
     sprint.prepare(context)
     search = search_of(context, FAR, budget=1e-4)
-    assert not list(sprint.guesses(search)) and search.budget.over()
+    assert not list(sprint.initial_motions(search)) and search.budget.over()
 
 
 def test_a_robot_that_leaves_takes_only_what_the_guard_will_hardly_stop(

@@ -99,14 +99,14 @@ def test_only_faster_motions_are_wanted_where_there_is_no_conflict(context: RunC
 def test_the_rest_of_the_motion_noised_and_denoised_again_strays_from_it(context: RunContext) -> None:
     source, search = Renoised(), search_of(context, conflict=0.6)
     source.prepare(context)
-    guesses = list(source.guesses(search))
-    assert len(guesses) == source.count and search.budget.counts["proposal"] == source.count
-    for guess in guesses:
-        assert np.abs(guess.states[0] - search.start.position).max() < 1e-6
-        assert np.abs(guess.states[-1] - context.goals[0]).max() < 1e-6
-    assert np.abs(guesses[0].states - guesses[1].states).max() > 1e-3
-    again = list(source.guesses(search_of(context, conflict=0.6)))
-    assert all(np.array_equal(one.states, other.states) for one, other in zip(guesses, again, strict=True))
+    initial_motions = list(source.initial_motions(search))
+    assert len(initial_motions) == source.count and search.budget.counts["proposal"] == source.count
+    for initial in initial_motions:
+        assert np.abs(initial.states[0] - search.start.position).max() < 1e-6
+        assert np.abs(initial.states[-1] - context.goals[0]).max() < 1e-6
+    assert np.abs(initial_motions[0].states - initial_motions[1].states).max() > 1e-3
+    again = list(source.initial_motions(search_of(context, conflict=0.6)))
+    assert all(np.array_equal(one.states, other.states) for one, other in zip(initial_motions, again, strict=True))
 
 
 def test_looking_at_stops_ends_with_the_time(context: RunContext) -> None:

@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from apex_ompl.moving.search import Search, least_duration
+from apex_ompl.moving.search import Search, shortest_duration
 from apex_ompl.moving.timed_spline import Start, TimedSpline
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory, time_path
@@ -159,7 +159,7 @@ def along(search: Search, states: Array, goal: Array) -> Trajectory | None:
 def _stretched(search: Search, states: Array, goal: Array) -> Trajectory | None:
     """Return the spline along states that takes as long as the limits ask for, or None where that is not found."""
     limits = search.context.limits
-    spline = TimedSpline.along(states, least_duration(states, limits), search.start, goal)
+    spline = TimedSpline.along(states, shortest_duration(states, limits), search.start, goal)
     for _ in range(STRETCHES):
         least = least_knot_spacing(spline.control, limits)
         if least <= spline.spacing:

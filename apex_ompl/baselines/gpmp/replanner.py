@@ -15,7 +15,7 @@ from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
-from apex_ompl.moving.search import STATES, Guess, Search, least_duration, rest_of_route
+from apex_ompl.moving.search import STATES, InitialMotion, Search, rest_of_route, shortest_duration
 from apex_ompl.moving.timed_spline import PINNED, Start, TimedSpline
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing
@@ -62,27 +62,27 @@ class IncrementalGPMP2:
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
         """Return the first motion that is proved among what is expected, or none."""
         search = Search(context, request, budget)
-        for part, guess in self.guesses(search):
+        for part, initial in self.initial_motions(search):
             for factor in self.factors:
                 if budget.over():
                     return Answer(None, "", budget)
-                motion = self.motion(search, guess, factor * guess.duration)
+                motion = self.motion(search, initial, factor * initial.duration)
                 if motion is not None:
                     return Answer(search.following(motion), part, budget)
         return Answer(None, "", budget)
 
-    def guesses(self, search: Search) -> Iterator[tuple[str, Guess]]:
+    def initial_motions(self, search: Search) -> Iterator[tuple[str, InitialMotion]]:
         """Yield motions to start from, and what they are."""
         limits, rest = search.context.limits, rest_of_route(search)
         if rest is not None:
-            yield "route", Guess(rest, rest[-1], least_duration(rest, limits))
+            yield "route", InitialMotion(rest, rest[-1], shortest_duration(rest, limits))
         for goal in search.goals[: self.goals]:
             line = np.linspace(search.start.position, goal, STATES)
-            yield "line", Guess(line, goal, least_duration(line, limits))
+            yield "line", InitialMotion(line, goal, shortest_duration(line, limits))
 
-    def motion(self, search: Search, guess: Guess, duration: float) -> Trajectory | None:
+    def motion(self, search: Search, initial: InitialMotion, duration: float) -> Trajectory | None:
         """Return a proved motion that is about as long as asked for [s], or longer where limits ask for it, or None."""
-        supports, limits = self.supports(search, guess, duration), search.context.limits
+        supports, limits = self.supports(search, initial, duration), search.context.limits
         for _ in range(self.rounds):
             problem = self.problem(search, duration)
             best = self.optimum(problem, supports, search.budget.over)
@@ -103,12 +103,12 @@ class IncrementalGPMP2:
             duration *= slower
         return None
 
-    def supports(self, search: Search, guess: Guess, duration: float) -> Array:
+    def supports(self, search: Search, initial: InitialMotion, duration: float) -> Array:
         """Return supports to start from, shape (N + 1, 2, dof)."""
         count = self.parameters.intervals + 1
-        wanted, at = np.linspace(0.0, len(guess.states) - 1.0, count), np.arange(len(guess.states))
-        positions = np.stack([np.interp(wanted, at, column) for column in guess.states.T], axis=1)
-        positions[0], positions[-1] = search.start.position, guess.goal
+        wanted, at = np.linspace(0.0, len(initial.states) - 1.0, count), np.arange(len(initial.states))
+        positions = np.stack([np.interp(wanted, at, column) for column in initial.states.T], axis=1)
+        positions[0], positions[-1] = search.start.position, initial.goal
         velocities = np.gradient(positions, duration / (count - 1), axis=0)
         velocities[0], velocities[-1] = search.start.velocity, 0.0
         return np.stack([positions, velocities], axis=1)

@@ -1,4 +1,4 @@
-"""Steps aside: for a robot that is at rest where an obstacle comes, or moves to where one will be."""
+"""Where a robot moves that finds no motion to a goal: aside from an obstacle, or to a waiting state."""
 
 from __future__ import annotations
 
@@ -11,49 +11,48 @@ from apex_ompl.moving.search import Search, rest_of_route
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
 
-SOON = 1.2  # time before a contact from which on a step aside is looked for [s]
-URGENT = 0.5  # time before one from which on that comes before anything else [s]
-AROUND, STRAYS = 24, (0.05, 0.2, 0.4)  # states that a robot may step aside to, and how far they are at first [rad]
-ASCENTS, STRIDE = 3, 0.25  # steps of these away from obstacles, and their length [rad]
-LOOKS, SEEN = 4, 0.3  # moments at which such a state is looked at, and distances that are told apart [m]
-DURATION = 0.35  # about how long a step aside takes [s]
-GAIN = 0.2  # time that a step aside that is touched in the end must gain [s]
-BACK = 6  # states of the last motion to a goal, and the start of the run, that it may go to as well
+SOON = 1.2  # time before a contact below which a step aside is sought [s]
+URGENT = 0.5  # time before a contact below which a step aside is sought first [s]
+AROUND, STRAYS = 24, (0.05, 0.2, 0.4)  # number of states to step aside to, and their initial distances [rad]
+ASCENTS, STRIDE = 3, 0.25  # gradient steps of these states away from obstacles, and their length [rad]
+LOOKS, SEEN = 4, 0.3  # times at which such a state is checked, and largest clearance that is computed [m]
+DURATION = 0.35  # typical duration of a step aside [s]
+GAIN = 0.2  # time that a step aside must gain where it is touched in the end [s]
+BACK = 6  # number of states of the last motion to a goal that the robot may go back to
 NEARNESS = 0.05  # clearance that a step shorter by 1 rad is worth [m]
-SHARES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.15)  # of the way to a goal, the nearest to it first
-NEAREST_GOALS = 2  # nearest goals to which that is tried
-LEAST_NEARER = 0.1  # distance that a robot comes nearer to a goal at least [rad]
+SHARES = (0.9, 0.75, 0.6, 0.45, 0.3, 0.15)  # shares of the way to a goal at which the robot may wait
+NEAREST_GOALS = 2  # number of goals to which the robot may move nearer
+LEAST_NEARER = 0.1  # least distance by which a waiting state is nearer to a goal [rad]
 
 
 def endangered(following: Following, at: float, conflict: float, within: float = SOON) -> bool:
-    """Whether a robot stands at a time, and an obstacle is to touch it within some time from then.
+    """Whether a robot will be at rest at a time, and an obstacle will touch it within some time after that.
 
     Args:
-        following: What the robot follows.
+        following: The motion that the robot follows.
         at: Clock time [s].
-        conflict: That of the first contact that is predicted of what it follows [s], infinite without one.
-        within: The time from ``at`` on [s].
+        conflict: Clock time of the first predicted contact [s], infinite without one.
+        within: The time after ``at`` [s].
     """
     return following.at_rest(at) and conflict < at + within
 
 
 def threatened(following: Following, at: float, conflict: float) -> bool:
-    """Whether a robot that moves at a time, as :func:`endangered` has it, comes into conflict soon."""
+    """Whether a robot will be moving at a time, and comes into conflict soon; the arguments of :func:`endangered`."""
     return not following.at_rest(at) and conflict < at + SOON
 
 
 def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
-    """Return the straight motion to a state nearby that stays clear, or else clear for longest, or None.
+    """Return the straight motion to a state nearby that stays clear, or else the longest clear one, or None.
 
-    One that starts while the robot moves is the fastest to that state. Besides states around, the robot may go back: to
-    states of its last motion to a goal, and to where it started. Where
-    motions aside are to be proved clear of all that obstacles can reach, the states are clear of that at the arrival
-    where possible, and motions that are proved come first; another one may still have a fail-safe stop at each of its
-    steps.
+    A motion that starts while the robot moves is the fastest to that state. Besides states nearby, the robot may go
+    back to states of its last motion to a goal, and to its start. Where steps aside must be proved clear of all
+    reachable sets, the states are clear of these at the arrival where possible, and proved motions come first; another
+    one may still have a fail-safe stop at each of its steps.
 
     Args:
         search: The replan.
-        proved: Whether only a motion that is proved is of use.
+        proved: Whether only a proved motion is returned.
     """
     request, context = search.request, search.context
     q, limits, hold = search.start.position, context.setup.robot.limits, context.settings.rest_hold
@@ -106,7 +105,7 @@ def _to(search: Search, state: Array) -> Trajectory | None:
 def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
     """Return clearances of states at some times [m], and their gradients.
 
-    Where motions aside are to be proved, the last column is that to all that obstacles can reach at the first time.
+    Where steps aside must be proved, the last column is the clearance to the reachable sets at the first time.
 
     Args:
         search: The replan.
@@ -140,10 +139,10 @@ def _back(search: Search) -> Array:
 
 
 def wait_nearer(search: Search) -> Trajectory | None:
-    """Return a motion from rest to a state nearer to a goal that stays clear for a while, or None.
+    """Return a motion from rest to a waiting state, nearer to a goal, that stays clear for a while, or None.
 
-    The states are on the straight lines to the nearest goals, and on what is left of the last motion to a goal; the
-    robot goes straight to them.
+    The states are on the straight lines to the nearest goals, and on the remaining motion to a goal. The motion to a
+    state is straight.
     """
     q, context = search.start.position, search.context
     for state in _waiting_states(search):
@@ -160,7 +159,7 @@ def wait_nearer(search: Search) -> Trajectory | None:
 
 
 def _waiting_states(search: Search) -> Array:
-    """Return the states where it may wait, shape (N, dof), the nearest to a goal first."""
+    """Return the waiting states, shape (N, dof), the nearest to a goal first."""
     q, goals = search.start.position, search.goals
     ways = [q + np.array(SHARES)[:, None] * (goal - q) for goal in goals[:NEAREST_GOALS]]
     rest = rest_of_route(search)

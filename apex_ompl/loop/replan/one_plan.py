@@ -1,4 +1,4 @@
-"""Stop and wait: the rest of the first plan, as soon as that is proved."""
+"""Replanners with one kind of plan: stop and wait, RRTConnect from rest, and the paper's single proposal."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ def timed(search: Search, states: Array) -> Trajectory | None:
 
 @dataclass(eq=False)
 class StopAndWait:
-    """The rest of the first plan, from where the robot stopped, as soon as that is proved: stop and wait.
+    """Stop and wait: the rest of the first plan, from where the robot stopped, as soon as that is proved.
 
     Attributes:
         first: Makes the first plan.
-        retimes: Whether its speed is chosen anew among what comes (path-velocity decomposition, Kant and Zucker 1986),
+        retimes: Whether it is retimed among dynamic obstacles (path-velocity decomposition, Kant and Zucker 1986),
             while the robot moves and from rest.
     """
 
@@ -77,13 +77,9 @@ class StopAndWait:
             search.take(motion, "resume")
         elif motion is not None and self.retimes:
             made = retime(
-                context.kernel,
-                request.predicted,
-                motion,
-                context.limits,
-                clock=request.join,
+                context.kernel, request.predicted, motion, context.limits, clock=request.join,
                 hold=context.settings.hold,
-            )
+            )  # fmt: skip
             budget.spend("retiming")
             if made.trajectory is not None and search.accepts(made.trajectory):
                 search.take(made.trajectory, "retime")
@@ -92,7 +88,7 @@ class StopAndWait:
 
 @contextmanager
 def spending(validator: MotionValidator, context: RunContext, budget: ComputeBudget, proved: bool) -> Iterator[None]:
-    """While the block runs, charge every motion that is checked, and prove it clear of static obstacles if asked."""
+    """While the block runs, count every motion that is checked, and check it continuously where asked."""
     check = validator.check
 
     def counted(first: Array, second: Array) -> bool:
@@ -108,21 +104,22 @@ def spending(validator: MotionValidator, context: RunContext, budget: ComputeBud
 
 @dataclass(eq=False)
 class RRTConnectFromRest:
-    """OMPL's RRTConnect, with the range that is tuned on validation, among obstacles where they are seen now.
+    """OMPL's RRTConnect, with its range tuned on validation problems, among obstacles where they are seen now.
 
-    What it finds is followed if it is proved among obstacles as they are predicted. As if they stood is no better: of
-    24 worlds ``moving`` of the validation split, at a quarter of the velocity limits, 12 are solved as it is, 11 so.
-    Where a motion is not proved clear of static obstacles, a path is looked for whose straight motions are.
+    Its motion is followed if it is proved among the predicted obstacles. A proof as if obstacles were at rest is no
+    better: of 24 worlds ``moving`` of the validation split, at a quarter of the velocity limits, 12 are solved with the
+    prediction and 11 without. Where a motion is not proved clear of static obstacles, a path of proved straight motions
+    is sought.
     """
 
     _setup: PlanningSetup | None = field(default=None, repr=False)
 
     def prepare(self, context: RunContext) -> None:
-        """Set OMPL up with a checker of its own, whose obstacles are placed anew by each replan."""
+        """Set OMPL up with a checker of its own, whose obstacles each replan places."""
         self._setup = assemble(context.setup.problem, context.setup.robot, checker=fresh_checker(context))
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
-        """Return a motion from rest that is proved among what is expected, or none."""
+        """Return a motion from rest that is proved among the predicted obstacles, or none."""
         search = Search(context, request, budget)
         for proved in (False, True) if request.following.at_rest(request.join) else ():
             states = self.path(search, proved)
@@ -138,7 +135,7 @@ class RRTConnectFromRest:
 
         Args:
             search: The replan.
-            proved: Whether each straight motion is proved clear of static obstacles; else it is looked at in steps.
+            proved: Whether each straight motion is checked continuously; else it is checked in steps.
         """
         assert self._setup is not None
         setup = self._setup
@@ -175,7 +172,7 @@ class OneProposal:
     Obstacles stand where they are seen. All steps of denoising are made, however long that takes.
 
     Attributes:
-        guided: Whether the path is drawn away from obstacles while it is denoised (equation 7).
+        guided: Whether guidance moves the path away from obstacles while it is denoised (equation 7).
         model: Name or folder of the checkpoint.
     """
 
@@ -193,7 +190,7 @@ class OneProposal:
         self._loaded, self._checker = shared_model(self.model, robot=context.setup.robot.name), fresh_checker(context)
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
-        """Return a motion from rest along one path, which nothing has proved, or none where the robot moves."""
+        """Return an unproved motion from rest along one path, or none where the robot moves."""
         search = Search(context, request, budget)
         assert self._checker is not None
         if not request.following.at_rest(request.join):

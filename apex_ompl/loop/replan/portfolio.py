@@ -19,29 +19,29 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.timing.moving_start import through
 from apex_ompl.types import Array
 
-FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried in turn, as multiples of what a path takes at least
+FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried, as multiples of the shortest one; by turns
 GOALS = 2  # nearest goals that are tried directly
 ENOUGH = 10  # candidates at which no further source is asked
-ASIDE = 0.7  # share of the budget that other parts have where it may step aside after them
-WAITING = 0.85  # and where a robot that stands may go nearer to a goal
+ASIDE = 0.7  # share of the budget for the other parts where a step aside may follow
+WAITING = 0.85  # and where a motion to a waiting state may follow
 CARRIED = 6  # candidates that are carried over to the next replan
-SHARE = 0.5  # of the time that is left, for candidates before the next source is asked
+SHARE = 0.5  # share of the remaining time for the candidates before the next source is asked
 TRIES = ((2, 1.25), (3, 1.25), (2, 1.0), (4, 1.1), (3, 1.0))  # numbers of pieces, and factors on the speed between them
-LIMIT_SHARE = 0.98  # of the limits that speeds and accelerations between pieces have at most
+LIMIT_SHARE = 0.98  # largest share of the limits of speeds and accelerations between pieces
 
 
 @dataclass(eq=False)
 class Portfolio:
     """Retiming, and a pool of motions in space and time from several sources; what arrives first is taken.
 
-    Candidates of a replan that failed are carried over to the next one of the same run. Where only a faster motion is
-    of use, none are, and each replan starts with another source.
+    Candidates of a failed replan are carried over to the next one of the same run. Where only a faster motion is
+    useful, none are, and each replan starts with another source.
 
     Attributes:
-        sources: Where motions to start from come from, those that gain most for their time first.
-        retimes: Whether the speed along the rest of the motion is chosen anew.
-        evades: Whether a robot that stands where an obstacle comes steps aside.
-        waits: Whether one that stands, while no way to a goal is found, goes nearer to it.
+        sources: Sources of initial motions, those that gain most for their time first.
+        retimes: Whether the remaining motion is retimed.
+        evades: Whether a robot at rest steps aside from an obstacle that comes.
+        waits: Whether a robot at rest moves to a waiting state nearer to a goal where no motion to a goal is found.
     """
 
     sources: Sequence[Source]
@@ -57,7 +57,7 @@ class Portfolio:
             source.prepare(context)
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
-        """Return a motion from the time of joining on that is proved among what is expected, or none."""
+        """Return a motion from the time of joining on that is proved among the predicted obstacles, or none."""
         search = Search(context, request, budget)
         evade, danger = context.settings.evade, (request.following, request.join, request.contact)
         comes = self.evades and evade != "never" and endangered(*danger)
@@ -70,7 +70,7 @@ class Portfolio:
         flees = self.evades and evade != "never" and threatened(request.following, request.join, request.conflict)
         aside = aside or (flees and request.reachable is not None)
         if (aside and fallback is None) or waits:
-            search.until = (WAITING if waits else ASIDE) * budget.limit  # some time is left for that
+            search.until = (WAITING if waits else ASIDE) * budget.limit  # the rest of the time is kept for that
         if self.retimes:
             motion = retimed(search)
             if motion is not None:
@@ -101,7 +101,7 @@ class Portfolio:
 
     @staticmethod
     def _wait_nearer(search: Search) -> None:
-        """Take a motion to where the robot may wait, where there is one."""
+        """Take a motion to a waiting state, where there is one."""
         nearer = wait_nearer(search)
         if nearer is not None:
             search.best, search.part = search.following(nearer), "wait"
@@ -136,22 +136,22 @@ class Portfolio:
 
     @staticmethod
     def _ask(source: Source, search: Search, pool: MotionPool) -> None:
-        """Take the motions of a source into the pool."""
-        for guess in source.guesses(search):
-            for factor in (1.0,) if guess.timed else FACTORS[search.request.number % len(FACTORS)]:
+        """Add the initial motions of a source to the pool."""
+        for initial in source.initial_motions(search):
+            for factor in (1.0,) if initial.timed else FACTORS[search.request.number % len(FACTORS)]:
                 if search.budget.over():
                     return
-                least = factor * guess.duration
+                least = factor * initial.duration
                 if least >= search.wanted():
                     continue
-                timed = guess.states, least
-                made = timed if guess.timed else search.shaped(guess.states, guess.goal, least)
+                timed = initial.states, least
+                made = timed if initial.timed else search.shaped(initial.states, initial.goal, least)
                 if made is not None and made[1] < search.wanted():
-                    pool.add(*made, guess.goal, source.name)
+                    pool.add(*made, initial.goal, source.name)
 
     @staticmethod
     def _improve(search: Search, pool: MotionPool, until: float) -> bool:
-        """Improve motions until a time by the charges; return whether there is more to improve."""
+        """Improve motions until a time of the budget [s]; return whether there is more to improve."""
         while True:
             found = pool.improve(search.wanted, until)
             if found is None:
@@ -163,14 +163,14 @@ class Portfolio:
 
 
 def take_faster(search: Search, motion: Trajectory) -> None:
-    """Take a faster motion through states of one that is proved, where there is one that is proved, too."""
+    """Take a proved faster motion through states of a proved motion, where there is one."""
     for faster in faster_motions(search, motion):
         if search.accepts(faster) and search.take(faster, "quicken"):
             return
 
 
 def straight(search: Search, goal: Array) -> Trajectory | None:
-    """Return the direct motion to a goal, or a slower or retimed one, that is proved, or None."""
+    """Return a proved direct motion to a goal, the fastest or a retimed one, or None."""
     context, request = search.context, search.request
     fastest = search.direct(goal)
     if fastest is None or fastest.duration <= 0.0 or fastest.duration >= search.wanted():
@@ -190,7 +190,7 @@ def straight(search: Search, goal: Array) -> Trajectory | None:
 
 
 def retimed(search: Search) -> Trajectory | None:
-    """Return the rest of the motion at another speed, where it goes to a goal and that is proved, or None."""
+    """Return the remaining motion to a goal, retimed and proved, or None."""
     context, request = search.context, search.request
     following = request.following
     if not following.to_goal or following.at_rest(request.join):
@@ -204,13 +204,13 @@ def retimed(search: Search) -> Trajectory | None:
 
 
 def faster_motions(search: Search, motion: Trajectory) -> Iterator[Trajectory]:
-    """Yield faster motions through states of a motion, which starts when the robot joins it and ends at rest.
+    """Yield faster motions through states of a motion, which starts at the time of joining and ends at rest.
 
-    Each is in a few pieces, the fastest between their states by Ruckig (Berscheid and Kroeger 2021). Splines cannot
-    change their acceleration as quickly as the limits of jerk allow.
+    Each has a few pieces, the fastest between their states by Ruckig (Berscheid and Kroeger 2021). Splines cannot
+    change their acceleration as quickly as the jerk limits allow.
 
     Args:
-        search: The replan under way.
+        search: The replan.
         motion: The motion.
     """
     limits, names, duration = search.context.limits, search.context.names, motion.duration

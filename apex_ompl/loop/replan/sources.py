@@ -1,4 +1,4 @@
-"""Fresh proposals of a trajectory model while the robot moves, with obstacles where they will be."""
+"""Sources of initial motions: the remaining motion, straight lines, proposals of a model, and a sprint of trees."""
 
 from __future__ import annotations
 
@@ -13,45 +13,53 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.trees import TreePair
 from apex_ompl.model.query import Query
 from apex_ompl.moving.context import RunContext
-from apex_ompl.moving.search import STATES, Guess, Search, fresh_checker, least_duration, place_nearest, rest_of_route
+from apex_ompl.moving.search import (
+    STATES,
+    InitialMotion,
+    Search,
+    fresh_checker,
+    place_nearest,
+    rest_of_route,
+    shortest_duration,
+)
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import resample
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
-FASTER = (0.92, 0.8)  # shares of the duration of a motion in which a faster one is looked for
-TEMPERATURES = (1.0, 1.6)  # of the noise, in one replan after the other
-BATCH = 16  # random states between two looks at the charges
+FASTER = (0.92, 0.8)  # shares of the duration of a motion that a faster one may have
+TEMPERATURES = (1.0, 1.6)  # temperatures of the noise, by turns of replans
+BATCH = 16  # random states between two checks of the budget
 WORK = "state of a tree"
 
 
 @dataclass(frozen=True)
 class Route:
-    """What is left of the last motion to a goal."""
+    """The remaining part of the last motion to a goal."""
 
     name: str = "route"
 
     def prepare(self, context: RunContext) -> None:
         """Nothing is needed."""
 
-    def guesses(self, search: Search) -> Iterator[Guess]:
+    def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the rest of the route, where there is one."""
         rest = rest_of_route(search)
         if rest is not None:
-            yield Guess(rest, rest[-1], least_duration(rest, search.context.limits))
+            yield InitialMotion(rest, rest[-1], shortest_duration(rest, search.context.limits))
 
 
 @dataclass(frozen=True)
 class Faster:
-    """The motion that is followed, faster."""
+    """The remaining motion, faster."""
 
     name: str = "faster"
 
     def prepare(self, context: RunContext) -> None:
         """Nothing is needed."""
 
-    def guesses(self, search: Search) -> Iterator[Guess]:
+    def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the rest of the motion, where it has no conflict."""
         request = search.request
         left = request.following.end - request.join
@@ -59,16 +67,16 @@ class Faster:
             times = request.join - request.following.start_time + np.linspace(0.0, left, STATES)
             states = request.following.motion(np.clip(times, 0.0, request.following.motion.duration))
             for factor in FASTER:
-                yield Guess(states, request.following.motion.positions[-1], factor * left, timed=True)
+                yield InitialMotion(states, request.following.motion.positions[-1], factor * left, timed=True)
 
 
 @dataclass(frozen=True)
 class Lines:
-    """Straight lines to the nearest goals, and lines with bumps.
+    """Straight lines to the nearest goals, or random perturbations of them.
 
     Attributes:
-        perturbed: Number of lines with bumps for each goal; 0 takes the straight line alone.
-        size: How far they stray [rad].
+        perturbed: Number of perturbed lines for each goal; 0 takes the straight line alone.
+        size: Amplitude of the perturbations [rad].
         goals: Number of goals.
     """
 
@@ -80,7 +88,7 @@ class Lines:
     def prepare(self, context: RunContext) -> None:
         """Nothing is needed."""
 
-    def guesses(self, search: Search) -> Iterator[Guess]:
+    def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the lines."""
         optimizer, fingers = Optimizer(), search.context.fingers
         for goal in search.goals[: self.goals]:
@@ -88,15 +96,15 @@ class Lines:
             starts[1:, :, fingers] = starts[0, :, fingers].T
             for control in starts[1:] if self.perturbed else starts:
                 states = optimizer.spline.path(control)
-                yield Guess(states, goal, least_duration(states, search.context.limits))
+                yield InitialMotion(states, goal, shortest_duration(states, search.context.limits))
 
 
 @dataclass(eq=False)
 class Proposals:
-    """Paths of a latent diffusion model from the state that the robot will be in.
+    """Paths of a latent diffusion model from the state that the robot will have.
 
-    The model was trained among obstacles that stand still. It is shown each dynamic obstacle where it comes nearest
-    to the straight line in time.
+    The model was trained among static obstacles. Its scene has each dynamic obstacle where it comes nearest to the
+    straight line in time.
 
     Attributes:
         model: Name or folder of the checkpoint, see :func:`apex_ompl.apex.models.trajectory_model`.
@@ -123,11 +131,11 @@ class Proposals:
 
     @property
     def model_and_checker(self) -> tuple[Model, CollisionChecker]:
-        """The model and the obstacles that it is shown, after :meth:`prepare`."""
+        """The model and the checker of its scene, after :meth:`prepare`."""
         assert self._loaded is not None and self._checker is not None
         return self._loaded, self._checker
 
-    def guesses(self, search: Search) -> Iterator[Guess]:
+    def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the proposals."""
         (model, checker), goals = self.model_and_checker, search.goals
         if not len(goals):
@@ -139,7 +147,7 @@ class Proposals:
             controls = self._made(search, query)
         for control in controls:
             states = model.spline.path(control)
-            yield Guess(states, goal, least_duration(states, search.context.limits))
+            yield InitialMotion(states, goal, shortest_duration(states, search.context.limits))
 
     def _made(self, search: Search, query: Query) -> Array:
         """Return control points of proposals, shape (B, points, dof)."""
@@ -157,10 +165,10 @@ class Proposals:
 
 @dataclass(eq=False)
 class Renoised(Proposals):
-    """What is left of the last motion to a goal, noised and denoised again: the paper's resampling, in flight.
+    """The remaining motion to a goal, noised and denoised again: the paper's resampling while the robot moves.
 
     Attributes:
-        noises: How far it is noised, as shares of the schedule, in one replan after the other.
+        noises: Noise levels as shares of the schedule, by turns of replans.
     """
 
     name: str = "renoise"
@@ -186,15 +194,14 @@ class Renoised(Proposals):
 
 @dataclass(eq=False)
 class Sprint:
-    """RRT-Connect in compiled code, for a robot that stands, from the second replan of a run on.
+    """RRT-Connect in compiled code, for a robot at rest, from the second replan of a run on.
 
-    Its paths are longer than those that other sources start from, so that they are no way to start a run.
-    Each dynamic obstacle stands where it comes nearest to the straight line in time; where it will touch the robot
-    at the start of the search, there is none.
+    Its paths are longer than those of other sources, so that the first replan does without. Each dynamic obstacle is
+    placed where it comes nearest to the straight line in time; there is no search where it touches the start there.
 
     Attributes:
         longest: Longest step of the trees [rad].
-        most: Random states, at most.
+        most: Largest number of random states.
     """
 
     longest: float = float(TUNED["apex"]["range"])
@@ -206,7 +213,7 @@ class Sprint:
         """Set up a checker of its own."""
         self._checker = fresh_checker(context)
 
-    def guesses(self, search: Search) -> Iterator[Guess]:
+    def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the path of the trees, where they meet in time."""
         assert self._checker is not None
         request = search.request
@@ -226,7 +233,7 @@ class Sprint:
             search.budget.spend(WORK, looked.proved + looked.blocked + looked.intervals)
             if path is not None:
                 states = resample(path, STATES)
-                yield Guess(states, path[-1], least_duration(states, search.context.limits))
+                yield InitialMotion(states, path[-1], shortest_duration(states, search.context.limits))
                 return
             if search.budget.over():
                 return
