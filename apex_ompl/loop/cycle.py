@@ -99,7 +99,7 @@ class Loop:
             {o.name for o in self._present},
         )  # fmt: skip
         start = context.setup.start
-        standing = Following.standing(start, 0.0, context.names, to_goal=context.is_goal(start))
+        standing = Following.resting(start, 0.0, context.names, to_goal=context.is_goal(start))
         self.executor = Executor(
             context, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
         )  # fmt: skip

@@ -253,7 +253,7 @@ class Executor:
             self.stop = None
         elif not self.following.at(now).moves:  # it has not started yet
             self.stop = None
-            self.follow(Following.standing(self.state(now), now, self.context.names), now)
+            self.follow(Following.resting(self.state(now), now, self.context.names), now)
             self.log(now, "stop", at=now)
         elif self.stop is None:
             self.log(now, "broken assumption", what="there is no fail-safe stop")

@@ -33,7 +33,7 @@ def requests(context: RunContext) -> tuple[Request, ...]:
     The robot is at rest; is at rest and about to be touched; moves towards the obstacle; and asks for a faster motion.
     """
     start, goal, settings = context.setup.start, context.goals[0], context.settings
-    standing = Following.standing(start, 0.0, context.names)
+    standing = Following.resting(start, 0.0, context.names)
     line = Following(time_path(np.stack([start, goal]), context.limits, context.names).trajectory, 0.0, to_goal=True)
     _, places = context.kernel.joint_frames(0.5 * (start + goal)[None])
     position = tuple(places[0, -1].tolist())

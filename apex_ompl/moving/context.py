@@ -1,4 +1,4 @@
-"""Motions that a robot follows by a clock, and what it did in the end."""
+"""What the closed loop keeps ready for replans: the robot among static obstacles, the motion that it follows, stops."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ GRAZING = 1e-4  # distance from still things and own parts, such as held objects
 
 @dataclass(frozen=True, eq=False)
 class Following:
-    """A motion that a robot follows; after its end it stands.
+    """A motion that a robot follows from a time on; the robot is at rest after its end.
 
     Attributes:
         motion: The motion, which ends at rest.
@@ -43,22 +43,22 @@ class Following:
     to_goal: bool = False
 
     @classmethod
-    def standing(cls, q: Array, time: float, joint_names: tuple[str, ...], *, to_goal: bool = False) -> Following:
+    def resting(cls, q: Array, time: float, joint_names: tuple[str, ...], *, to_goal: bool = False) -> Following:
         """Return rest at a state, shape (dof,), from a time on [s]."""
         still = np.zeros((1, len(q)))
         return cls(Trajectory(np.zeros(1), q[None].copy(), still, still, joint_names), time, to_goal)
 
     @cached_property
     def end(self) -> float:
-        """Clock time from which on the robot stands [s]."""
+        """Clock time from which on the robot is at rest [s]."""
         return self.start_time + self.motion.duration
 
     def after(self, head: Trajectory, start_time: float) -> Following:
-        """Return the motion behind another one, which starts at a clock time [s] and ends where it starts."""
+        """Return the motion after another one, which starts at a clock time [s] and ends where this one starts."""
         return Following(concatenate([head, self.motion]), start_time, self.to_goal)
 
     def at(self, time: float) -> Start:
-        """Return what the robot does at a clock time [s]."""
+        """Return position, velocity and acceleration at a clock time [s]."""
         at = min(max(time - self.start_time, 0.0), self.motion.duration)
         if at >= self.motion.duration - SAME_TIME:
             return Start.at_rest(self.motion.positions[-1].copy())
@@ -69,11 +69,11 @@ class Following:
         return self.at(time).position
 
     def at_rest(self, time: float) -> bool:
-        """Whether the robot stands from a clock time on [s]."""
+        """Whether the robot is at rest from a clock time on [s]."""
         return time >= self.end - SAME_TIME
 
     def piece(self, start: float, end: float) -> Trajectory:
-        """Return what the robot does between two clock times [s]."""
+        """Return the motion of the robot between two clock times [s]."""
         if self.at_rest(start) or end <= self.start_time + SAME_TIME:
             times = np.array([0.0, end - start] if end > start else [0.0])
             q = np.repeat(self.motion.positions[[-1 if self.at_rest(start) else 0]], len(times), axis=0)
@@ -92,7 +92,12 @@ class Following:
 
 
 def executed(followed: list[tuple[float, Following]], end: float) -> Trajectory:
-    """Return what a robot did up to a time, of what it followed from which times on."""
+    """Return the executed motion up to a time [s].
+
+    Args:
+        followed: The motions that the robot followed, and from which clock times on [s].
+        end: Clock time at which it ends [s].
+    """
     ends = [start for start, _ in followed[1:]] + [end]
     pieces = [
         one.piece(start, until) for (start, one), until in zip(followed, ends, strict=True) if until > start + SAME_TIME
@@ -117,7 +122,7 @@ class RunContext:
     settings: LoopSettings
 
     def __post_init__(self) -> None:
-        """Compile what runs need, where that was not done yet."""
+        """Compile the functions of runs, where that was not done yet."""
         compile_ahead(RUNS)
 
     @property
@@ -142,22 +147,22 @@ class RunContext:
 
     @property
     def fingers(self) -> list[int]:
-        """Indices of the planned joints that close hands, which stay where there is nothing to be grasped."""
+        """Indices of the planned joints that close hands, which do not move where nothing is grasped."""
         synergies = (hand.synergy for hand in self.setup.robot.hands.values())
         return [self.names.index(name) for name in synergies if name in self.names]
 
     def is_goal(self, q: Array) -> bool:
-        """Whether a state, shape (dof,), is a goal, as the referee sees it: stops may end that near to one."""
+        """Whether a state, shape (dof,), is a goal within the referee's tolerance."""
         return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) <= SAME_STATE).any())
 
     def clear_of_static(self, motion: Trajectory, budget: ComputeBudget | None = None) -> bool:
-        """Whether a motion keeps the limits, and is proved as by :meth:`is_clear`."""
+        """Whether a motion keeps the limits, and is clear by :meth:`is_clear`."""
         return self.keeps_limits(motion) and self.is_clear(curve_of(motion), budget)
 
     def is_clear(self, curve: Curve, budget: ComputeBudget | None = None) -> bool:
-        """Whether a curve is proved free of static obstacles and of the robot itself.
+        """Whether a curve is proved clear of static obstacles and of self-collision.
 
-        It does not graze either, but where it starts like that: pieces of it are proved again where they are joined.
+        Its clearance is ``GRAZING`` or more, unless it starts with less: pieces of it are proved again at joining.
         """
         proof = self.checker.prove(curve, tolerance=0.0)
         if budget is not None:
@@ -166,11 +171,11 @@ class RunContext:
         return bool(proof) and (proof.clearance >= GRAZING or self._touches(curve.states[0]))
 
     def line_is_clear(self, first: Array, last: Array, budget: ComputeBudget | None = None) -> bool:
-        """Whether the straight motion between two states, shape (dof,), is proved as by :meth:`is_clear`."""
+        """Whether the straight motion between two states, shape (dof,), is clear by :meth:`is_clear`."""
         return self.is_clear(Curve.polyline(np.stack([first, last])), budget)
 
     def _touches(self, q: Array) -> bool:
-        """Whether static obstacles or the robot's own parts are nearer than a graze at a state, shape (dof,)."""
+        """Whether the clearance at a state, shape (dof,), is below ``GRAZING``."""
         states, still = np.stack([q, q]), np.zeros((2, len(q)))
         proof = self.checker.prove(Curve.cubic(np.array([0.0, 1.0]), states, still, still), tolerance=0.0)
         return not proof or proof.clearance < GRAZING
@@ -192,9 +197,9 @@ class RunContext:
         Args:
             dynamic: The obstacles.
             following: The motion.
-            start: Clock time from which on it is looked at [s].
-            until: Time until which it is looked at [s], after its end, too.
-            budget: Gets the number of intervals.
+            start: Clock time at which the check starts [s].
+            until: Clock time at which it ends [s], which may be after the end of the motion.
+            budget: Counts the intervals.
         """
         zero = following.start_time
         found = prove_motion(self.kernel, dynamic, following.motion, start - zero, until - zero, clock=zero)
@@ -205,31 +210,30 @@ class RunContext:
     def proved_to_rest(
         self, reachable: DynamicObstacles, following: Following, budget: ComputeBudget | None = None
     ) -> bool:
-        """Whether nothing that obstacles can reach comes in the way of a motion until the robot is at rest again.
+        """Whether a motion is proved clear of reachable sets until the robot is at rest again.
 
         Args:
-            reachable: The obstacles, as large as all that they can reach.
+            reachable: The reachable sets of the obstacles.
             following: The motion.
-            budget: Gets the number of intervals.
+            budget: Counts the intervals.
         """
         return bool(np.isinf(self.first_conflict(reachable, following, following.start_time, following.end, budget)))
 
     def proved_stop(
         self, reachable: DynamicObstacles, following: Following, now: float, then: float
     ) -> Following | None:
-        """Return a stop from a motion at a later time that nothing can come in the way of, or None.
+        """Return a proved stop from a motion at a later time, or None.
 
-        Whatever obstacles do that were seen where ``reachable`` says, they touch the robot neither until that time nor
-        during the stop.
+        The motion until that time and the stop are proved clear of the reachable sets.
 
         Args:
-            reachable: The obstacles, as large as all that they can reach.
+            reachable: The reachable sets of the obstacles.
             following: The motion.
             now: Clock time [s].
             then: Clock time at which the stop starts [s].
         """
         if following.at_rest(then):
-            stopped = Following.standing(following.motion.positions[-1], then, self.names, to_goal=following.to_goal)
+            stopped = Following.resting(following.motion.positions[-1], then, self.names, to_goal=following.to_goal)
             clear = following.at_rest(now) or np.isinf(self.first_conflict(reachable, following, now, following.end))
             return stopped if clear else None
         if np.isfinite(self.first_conflict(reachable, following, now, then)):
@@ -243,16 +247,16 @@ class RunContext:
     def foreseen_stops(
         self, predicted: DynamicObstacles, following: Following, moments: Array, age: float, spread: float
     ) -> tuple[int, int]:
-        """Return behind how many clock times, from the first on, stops from a motion will hardly be refused.
+        """Return how many of some clock times, from the first on, have a stop that is predicted to be proved.
 
-        They are proved by what will be known then, by what is known now (:func:`stops_proved`).
+        The prediction takes the observations that will be known then (:func:`stops_proved`).
 
         Args:
-            predicted: The obstacles.
+            predicted: The predicted obstacles.
             following: The motion.
             moments: Clock times, shape (N,) [s].
-            age: How old what is known will be [s].
-            spread: By how much more than the error assumed places will differ from those expected [m].
+            age: Age of the observations then [s].
+            spread: Difference of places from predicted ones, beyond the assumed error [m].
 
         Returns:
             Their number; and of how many of those looked at the stop is one of each joint by itself.
@@ -270,12 +274,12 @@ class RunContext:
         return count, len(left)
 
     def unproved_stop(self, following: Following, then: float) -> Following:
-        """Return a stop from a motion along its path from a clock time on [s]."""
+        """Return a stop along the path of a motion from a clock time on [s], unproved."""
         made = stop_along(following.motion, then - following.start_time, self.stopping)
         return Following(made.trajectory, then, self.is_goal(made.trajectory.positions[-1]))
 
     def clear_stop(self, following: Following, then: float, along: bool) -> Following | None:
-        """Return a stop from a motion along its path, or else joint by joint, that meets nothing that stands still."""
+        """Return a stop along the path of a motion, or joint by joint, that is clear of static obstacles, or None."""
         at = then - following.start_time
         if along:
             made = stop_along(following.motion, at, self.stopping)

@@ -1,4 +1,4 @@
-"""Dynamic obstacles, beside the scene: proofs of timed motions among them, and clearances in time."""
+"""Dynamic obstacles: continuous collision checks of timed motions among them, and clearances in time."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ PREPARED = 64  # motions whose curves are kept
 
 
 class DynamicObstacles:
-    """Dynamic obstacles at constant velocity without turning, outside of the scene that a kernel has.
+    """Dynamic obstacles at constant velocity without rotation, beside the scene of a kernel.
 
     Each has a place and a velocity at a time stamp, and a margin by which it counts as larger, which may grow behind
     the time stamp. An update is a write to an array.
 
     Attributes:
         names: Names of the obstacles.
-        arrays: The solids that they are made of, see
+        arrays: Their solids, see
             :class:`apex_ompl.kernel.compiled.dynamic_obstacles.DynamicArrays`; views of ``packed``.
-        packed: What compiled code takes.
+        packed: The same arrays as compiled code takes them.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class DynamicObstacles:
         Meshes, points, voxels and grids of distances move as grids of distances.
 
         Args:
-            obstacles: The obstacles; those without a velocity stand still.
+            obstacles: The obstacles; those without a velocity are at rest.
             allowed: Bodies, as rows of the robot's tables, and names of dynamic obstacles that they may touch.
             stamp: Time of the places [s].
 
@@ -113,11 +113,11 @@ class DynamicObstacles:
         self, name: str, position: ArrayLike | None = None, velocity: ArrayLike | None = None,
         *, stamp: float | None = None, growth: tuple[float, float] | None = None,
     ) -> None:  # fmt: skip
-        """Write what is known of an obstacle now; what is not given stays.
+        """Update an obstacle; what is not given stays.
 
         Args:
             name: Its name.
-            position: Where it was at the time stamp, shape (3,) [m].
+            position: Position at the time stamp, shape (3,) [m].
             velocity: Shape (3,) [m/s].
             stamp: Time stamp [s].
             growth: Margin at the time stamp [m], and its growth after it [m/s]; neither is negative.
@@ -144,10 +144,10 @@ class DynamicObstacles:
             self.arrays.stamp[mine] = stamp
 
     def placed(self, positions: Array, velocities: Array, growth: Array, stamps: Array) -> DynamicObstacles:
-        """Return a copy in which all that is known of the obstacles is written, as by :meth:`update` but unchecked.
+        """Return a copy with other positions, velocities and margins, unchecked.
 
         Args:
-            positions: Where they were at the time stamps, shape (N, 3) [m].
+            positions: Positions at the time stamps, shape (N, 3) [m].
             velocities: Shape (N, 3) [m/s].
             growth: Margins at the time stamps [m], and their growth after them [m/s], shape (N, 2).
             stamps: Time stamps, shape (N,) [s].
@@ -172,13 +172,13 @@ class DynamicObstacles:
         return other
 
     def nominal(self, margin: float) -> DynamicObstacles:
-        """Return a copy whose margins are at most so large [m], and do not grow."""
+        """Return a copy whose margins are at most a distance [m], and do not grow."""
         other = self.with_margin(margin)
         other.arrays.growth[:, 0] = np.minimum(self.arrays.growth[:, 0], margin)
         return other
 
     def at(self, time: float) -> dict[str, Array]:
-        """Return where the obstacles are at a time [s]: positions, shape (3,) [m], by name."""
+        """Return the positions of the obstacles at a time [s], shape (3,) [m], by name."""
         a, found = self.arrays, {}
         for row, name in enumerate(self.names):
             k = int(np.argmax(a.owner == row))
@@ -192,13 +192,13 @@ class DynamicObstacles:
 
 
 class Conflict(NamedTuple):
-    """Where a motion can no longer be proved.
+    """The first moment at which a motion is not proved clear.
 
     Attributes:
         time: First moment that cannot be proved [s from the motion's start]; infinite where all of it is proved.
-        body: Name of the body that is not proved apart there, empty where there is none.
-        dynamic obstacle: Name of the dynamic obstacle.
-        intervals: Number of intervals of time looked at.
+        body: Name of the body that is not proved clear there, empty where there is none.
+        dynamic_obstacle: Name of the dynamic obstacle.
+        intervals: Number of intervals of time that were checked.
     """
 
     time: float
@@ -213,7 +213,7 @@ class Conflict(NamedTuple):
 
 @lru_cache(maxsize=PREPARED)
 def curve_of(motion: Trajectory) -> Curve:
-    """Return the cubic pieces of a motion as proofs take them; those of the last motions are kept."""
+    """Return the cubic pieces of a motion for collision checks; those of the last motions are cached."""
     return Curve.cubic(motion.times, motion.positions, motion.velocities, motion.accelerations)
 
 
@@ -221,20 +221,20 @@ def prove_motion(
     kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, start: float = 0.0, end: float | None = None,
     *, clock: float = 0.0, shortest: float = SHORTEST,
 ) -> Conflict:  # fmt: skip
-    """Prove that a timed motion stays apart from dynamic obstacles, and find the first moment that is not proved.
+    """Check a timed motion continuously among dynamic obstacles, and find the first moment that is not proved clear.
 
     The proof is that of the sphere covers along the motion's own cubic pieces
     (:mod:`apex_ompl.kernel.compiled.dynamic_obstacles`): it is sound, and may leave contacts of some millimeters open
     that there are not. The scene of the kernel and the robot itself are not looked at.
 
     Args:
-        kernel: The kernel of the robot with what it holds.
+        kernel: The kernel of the robot with its held objects.
         dynamic: The obstacles.
-        motion: The motion; after its end the robot stands.
-        start: Where on the motion to start [s].
-        end: Where to end [s], by default at its end.
+        motion: The motion; after its end the robot is at rest.
+        start: Time of the motion at which the check starts [s].
+        end: Time of the motion at which it ends [s], by default its duration.
         clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
-        shortest: Length of an interval of time that is given up [s].
+        shortest: Length of an interval of time that is not divided further [s].
 
     Raises:
         ParameterError: The motion is one of other joints, or a number is not finite.
@@ -266,11 +266,11 @@ def clearance_in_time(
     """Return the signed clearances of a robot's sphere cover to dynamic obstacles, and their gradients.
 
     Args:
-        kernel: The kernel of the robot with what it holds.
+        kernel: The kernel of the robot with its held objects.
         dynamic: The obstacles.
         states: States, shape (N, dof).
         times: Times of the dynamic obstacles' stamps, shape (N,) [s].
-        limit: Larger clearances are given as this [m]; a small one is faster.
+        limit: Larger clearances are returned as this [m]; a small one is faster.
 
     Returns:
         Values, shape (N,) [m], NaN where a state is not finite or a hand is outside its limits, margins subtracted;
@@ -303,9 +303,9 @@ class Piece(NamedTuple):
     """A piece of time in which all obstacles move at constant velocity.
 
     Attributes:
-        start: Its start [s].
-        end: Its end [s].
-        dynamic: The obstacles that are there, with ``start`` as their stamp; good until the next piece is asked for.
+        start: Start of the piece [s].
+        end: End of the piece [s].
+        dynamic: The obstacles that exist then, with ``start`` as their stamp; valid until the next piece is taken.
     """
 
     start: float
@@ -314,10 +314,10 @@ class Piece(NamedTuple):
 
 
 class ScriptedDynamicObstacles:
-    """Dynamic obstacles by scripts, beside a kernel's scene.
+    """Dynamic obstacles with scripts, beside the scene of a kernel.
 
     Attributes:
-        kernel: The kernel of the robot with what it holds.
+        kernel: The kernel of the robot with its held objects.
         obstacles: The obstacles with their scripts.
     """
 
@@ -346,7 +346,7 @@ class ScriptedDynamicObstacles:
         a hand is outside its limits.
 
         Args:
-            motion: The motion; after its end the robot stands.
+            motion: The motion; after its end the robot is at rest.
             times: Shape (N,), increasing from 0 or more [s].
         """
         found = np.full(len(times), np.inf)
@@ -358,7 +358,7 @@ class ScriptedDynamicObstacles:
         return found
 
     def _dynamic(self, here: Sequence[Obstacle], time: float) -> DynamicObstacles:
-        """Return obstacles as they are from a time on [s]."""
+        """Return obstacles with their motion from a time on [s]."""
         names = tuple(o.name for o in here)
         if names not in self._known:
             rows = allowed_rows(self.kernel, self._allowed, names)

@@ -1,4 +1,4 @@
-"""Speed along a known path among dynamic obstacles: wait, slow down, hurry.
+"""Retiming: speed along a known path among dynamic obstacles, and the safe intervals of time along it.
 
 The path keeps its shape, and time along it is chosen anew (path-velocity decomposition, Kant and Zucker 1986; LaValle
 2006, section 7.1.3), among safe intervals of time (Phillips and Likhachev 2011).
@@ -27,28 +27,28 @@ from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_number
 
 STAGE = 0.04  # least length of a stage, in the motion's own time [s]
-STAGES = (4, 64)  # least and largest number of them
-PIECES = 4  # of a stage
+STAGES = (4, 64)  # least and largest number of stages
+PIECES = 4  # pieces of a stage
 SLOW = np.array([0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0])  # levels of the squared rate
 FAST = np.array([1.25, 1.6, 2.0, 2.5, 3.2, 4.0, 5.0, 6.5, 8.0, 10.0])
 UNIT = len(SLOW) - 1  # level of the motion's own rate
 SPACINGS = (0.012, 0.01, 0.008, 0.006, 0.004)  # of the motion's knots [s]
 SAME_PLACE = 1e-9  # [s]
-LEAD = 3  # steps that the motion that is made keeps the rate of the given one
-HEADS, EASY = 9, 0.8  # places that are looked at, and the share of the acceleration limits that leaves room there
+LEAD = 3  # steps for which the result keeps the rate of the given motion
+HEADS, EASY = 9, 0.8  # places at which the rate may start to change, and largest share of the acceleration limits there
 PUSHING = 0.4  # part of a window in which the acceleration along the path may change at the largest jerk
-HURRYING = 0.7  # share of the velocity limits up to which a motion may be hurried
+HURRYING = 0.7  # share of the velocity limits up to which a motion may become faster
 SAME_TIME = 1e-9  # [s]
-CHECKED = 0.005  # spacing at which what is left of the given motion is looked at [s]
+CHECKED = 0.005  # spacing at which the given motion is checked [s]
 
 
 class Attempt(NamedTuple):
-    """How a profile of speed is searched and followed.
+    """Parameters of one search of a speed profile.
 
     Attributes:
-        share: Of the limits of acceleration.
-        window: Over which the places of the profile are averaged in time, for lower jerks [s].
-        margin: By which blocked intervals are longer at each end for the search [s].
+        share: Share of the acceleration limits.
+        window: Time over which the places of the profile are averaged, for lower jerks [s].
+        margin: Time by which blocked intervals are longer at each end for the search [s].
         forced: Number of stages at the start that keep the motion's own rate; from rest at least two.
         hurries: Whether it may be faster than the motion.
     """
@@ -81,7 +81,7 @@ class Profile(NamedTuple):
 
 
 class Query(NamedTuple):
-    """What is asked for, see :func:`retime`."""
+    """Arguments of :func:`retime`."""
 
     time: float
     clock: float
@@ -113,18 +113,18 @@ def retime(
     clock: float = 0.0,
     hold: float = 1.0, horizon: float = 20.0, deviation: float = 1.5e-3,
 ) -> Retimed:  # fmt: skip
-    """Return the motion along the rest of a path that arrives first, among dynamic obstacles.
+    """Return the motion along the remaining path that arrives first, among dynamic obstacles.
 
     It starts with the state of the given motion at ``time`` exactly, ends at rest where that ends, and keeps the
     limits. Its places are kept out of the blocked intervals (:func:`apex_ompl.moving.retime.blocked`), so that
     :func:`apex_ompl.moving.dynamic_obstacles.prove_motion` seldom finds a conflict; only that is the proof.
 
     Args:
-        kernel: The kernel of the robot with what it holds.
+        kernel: The kernel of the robot with its held objects.
         dynamic: The obstacles.
         motion: A motion within the limits that ends at rest.
         limits: Limits of the joints.
-        time: Where on the motion to start [s].
+        time: Time of the motion at which the result starts [s].
         clock: Time of the dynamic obstacles' stamps at which the result starts [s].
         hold: Time for which the end must stay free from the arrival on [s].
         horizon: Largest duration of the result [s].
@@ -142,7 +142,7 @@ def retime(
 
 
 class _Search:
-    """Search of the speed along the rest of one motion."""
+    """Search of the speed along the remaining part of one motion."""
 
     def __init__(
         self, kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, limits: Limits, query: Query
@@ -168,7 +168,7 @@ class _Search:
         self.rests = not np.any(self.rates[:, 0])
 
     def result(self) -> Retimed:
-        """Return the first motion that keeps everything, of several attempts."""
+        """Return the motion of the first attempt that keeps limits, deviation and safe intervals."""
         stops, last = self.stops, self.stages
         if stops.meets(0, self.clock, self.clock):
             until = float(stops.spans[0, 0, 1]) - self.clock
@@ -190,12 +190,12 @@ class _Search:
         return Retimed(None, reason, 0.0)
 
     def _levels(self) -> Array:
-        """Return levels of the squared rate that the velocity limits leave room for."""
+        """Return levels of the squared rate within the velocity limits."""
         use = float((np.abs(self.rates[0]) / self.limits.velocity).max())
         return np.append(SLOW, FAST[FAST * use * use <= 1.0]) if use <= HURRYING else SLOW
 
     def _profile(self, attempt: Attempt) -> Profile | None:
-        """Return the profile that arrives first."""
+        """Return the profile with the earliest arrival, or None."""
         x, points = self._levels() if attempt.hurries else SLOW, self.stages + 1
         limits, window = self.limits, PUSHING * max(attempt.window, 2.0 * SPACINGS[0])
         lowest, highest = np.empty((2, self.rates.shape[1], len(x)))
@@ -213,7 +213,7 @@ class _Search:
         return Profile(x, levels, departures) if found else None
 
     def _motions(self, profile: Profile, window: float) -> Iterator[Retimed]:
-        """Yield motions with a profile that keep the limits, the deviation and the blocked intervals."""
+        """Yield motions with a profile that keep the limits, the deviation and the safe intervals."""
         _, levels, departures = profile
         waits = departures[:, 1] - departures[:, 0] > SAME_TIME
         own = (levels[:-1] == UNIT) & (levels[1:] == UNIT) & ~np.append(False, waits[1:-1])
@@ -237,7 +237,7 @@ class _Search:
                     yield Retimed(self._with_head(wait, start, times, states), "", off)
 
     def _starts(self, longest: float) -> list[float]:
-        """Return places from which to leave the given motion, the latest first, where it keeps from its limits."""
+        """Return places at which the rate may start to change, the latest first, where the motion has room to do so."""
         places = np.linspace(0.0, max(longest, 0.0), HEADS) + self.time
         looked = places[:, None] + SPACINGS[0] * np.arange(LEAD)
         use = np.abs(self.motion(looked.ravel(), 2)) / self.limits.acceleration
@@ -281,7 +281,7 @@ class _Search:
         return (times, out, float(off.max())) if off.max() <= self.deviation else None
 
     def _with_head(self, wait: float, end: float, times: Array, states: Array) -> Trajectory:
-        """Return the motion that waits, goes on along the given one up to a place, and then otherwise."""
+        """Return the motion that waits, follows the given motion up to a place, and then follows other states."""
         knots, lead = self.motion.times, end - self.time
         inner = (knots > self.time + SAME_TIME) & (knots < end - SAME_TIME)
         head = np.append(self.time, knots[inner]) if lead > SAME_TIME else np.empty(0)
@@ -296,7 +296,7 @@ class _Search:
         return Trajectory.unchecked(moments[kept], np.ascontiguousarray(rows[:, kept]), self.motion.joint_names)
 
     def _free(self, places: Array, start: float, h: float) -> bool:
-        """Whether places at times h apart meet no blocked interval; the end also for as long as it must be free."""
+        """Whether places at times h apart are outside of blocked intervals; the end also while it must stay free."""
         step = first_blocked(
             *self.pieces, self.points, self.stops.spans, self.stops.counts, places, float(start), h
         )  # fmt: skip
@@ -311,8 +311,8 @@ class Blocked(NamedTuple):
 
     Attributes:
         places: Starts and ends of the places, in the motion's own time, shape (P, 2) [s].
-        spans: Their intervals in order, shape (P, MOST_SPANS, 2) [s of the dynamic obstacles' stamps].
-        counts: Numbers of them, shape (P,).
+        spans: Their blocked intervals in order, shape (P, MOST_SPANS, 2) [s of the dynamic obstacles' stamps].
+        counts: Numbers of these intervals, shape (P,).
     """
 
     places: Array
@@ -320,7 +320,7 @@ class Blocked(NamedTuple):
     counts: NDArray[np.int64]
 
     def longer(self, by: float) -> Array:
-        """Return the intervals, longer at both ends [s]."""
+        """Return the intervals, longer by a time at both ends [s]."""
         longer: Array = self.spans + np.array([-by, by])
         return longer
 
@@ -340,17 +340,17 @@ def blocked(
     end: float,
     slack: float = 0.0,
 ) -> Blocked:
-    """Find when dynamic obstacles block places along a motion, by the robot's spheres: never too short.
+    """Return when dynamic obstacles block places along a motion, by the sphere cover: never too short intervals.
 
     Args:
-        kernel: The kernel of the robot with what it holds.
+        kernel: The kernel of the robot with its held objects.
         dynamic: The obstacles.
         motion: The motion.
         places: Starts and ends of pieces of the motion, in its own time and in order, shape (P, 2) [s]; the same twice
             for a single state.
-        start: First time that is looked at [s of the dynamic obstacles' stamps].
-        end: The last one [s].
-        slack: Distance from the path, of each joint, that counts as being on it [rad].
+        start: First time [s of the dynamic obstacles' stamps].
+        end: Last time [s].
+        slack: Largest distance of each joint from the path [rad].
     """
     curve, dof = curve_of(motion), motion.dof
     spans, counts = np.zeros((len(places), MOST_SPANS, 2)), np.empty(len(places), np.int64)

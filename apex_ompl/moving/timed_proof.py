@@ -1,4 +1,8 @@
-"""Proof that a timed motion stays apart from dynamic obstacles: sphere covers first, exact shapes where they end."""
+"""Continuous collision checks in time: of timed motions by spheres and exact shapes, and of timed paths by swept shapes.
+
+Obstacles move from time 0 on, when the motion or the path starts, at constant velocity or by a script
+(:mod:`apex_ompl.scene.scripts`).
+"""
 
 from __future__ import annotations
 
@@ -31,10 +35,10 @@ OBSTACLE_STEP = 0.005  # largest motion of an obstacle during one time interval 
 
 @dataclass(frozen=True)
 class TimedProof:
-    """Outcome of a proof.
+    """Outcome of the check of a timed motion.
 
     Attributes:
-        ok: Whether the motion is proved apart from the dynamic obstacles.
+        ok: Whether the motion is proved clear of the dynamic obstacles.
         reason: Why not: one sentence, empty for a proved motion.
         time: First moment that is not proved [s], infinite for a proved motion.
     """
@@ -49,22 +53,22 @@ class TimedProof:
 
 
 class TimedProver:
-    """Proofs of motions of one robot among dynamic obstacles; a :class:`CollisionChecker` proves those among others.
+    """Continuous checks of motions of one robot among dynamic obstacles; static ones are a :class:`CollisionChecker`'s.
 
     Attributes:
         dynamic: The dynamic obstacles.
-        obstacles: Their records, where they are at time 0.
+        obstacles: Their records at time 0.
     """
 
     def __init__(
         self, checker: CollisionChecker, obstacles: Iterable[Obstacle], allowed: Sequence[tuple[str, str]] = (),
         *, margin: float = 0.0,
     ) -> None:  # fmt: skip
-        """Prove motions of the robot of a checker, with what it holds, among dynamic obstacles.
+        """Check motions of the robot of a checker, with its held objects, among dynamic obstacles.
 
         Args:
-            checker: The robot; its obstacles are not looked at.
-            obstacles: The dynamic obstacles, where they are at time 0.
+            checker: The robot; its obstacles are not checked.
+            obstacles: The dynamic obstacles at time 0.
             allowed: Pairs of names of bodies that may touch.
             margin: Distance to keep from them [m].
 
@@ -82,11 +86,11 @@ class TimedProver:
         self._exact: dict[float, CollisionChecker] = {}  # by length of the slices
 
     def prove(self, motion: Trajectory, *, stop: Callable[[], bool] = lambda: False) -> TimedProof:
-        """Prove that a motion that starts at time 0 stays apart from the dynamic obstacles, to its end.
+        """Check whether a motion that starts at time 0 stays clear of the dynamic obstacles, to its end.
 
         Args:
             motion: The motion.
-            stop: Asked between slices of time whether to give up.
+            stop: Returns whether to give up; called between slices of time.
         """
         kernel, time, longest = self._checker.kernel, 0.0, SLICE
         while True:
@@ -103,7 +107,7 @@ class TimedProver:
                 return TimedProof(True, "", math.inf)
 
     def fault_at_start(self, q: Array) -> str:
-        """Return why the robot may not stand at a state, shape (dof,), at time 0 and a moment longer, or nothing."""
+        """Return why the robot may not be at a state, shape (dof,), at time 0 and shortly after, or nothing."""
         still = np.zeros((1, len(q)))
         rest = Trajectory(np.zeros(1), q[None], still, still, self._checker.robot.joint_names)
         if not prove_motion(self._checker.kernel, self.dynamic, rest, end=SHORTEST_SLICE):
@@ -111,7 +115,7 @@ class TimedProver:
         return self._prove_slice(rest, 0.0, SHORTEST_SLICE)[0]
 
     def _prove_slice(self, motion: Trajectory, start: float, longest: float) -> tuple[str, float]:
-        """Prove a slice of time by exact shapes: return the fault of the shortest slice, or nothing, and its length."""
+        """Check a slice of time by exact shapes; return the fault of the shortest slice, or nothing, and its length."""
         if not all(o.shape in INFLATED for o in self.obstacles):
             return "too near to a moving obstacle for a proof by spheres", 0.0
         length = longest
@@ -122,7 +126,7 @@ class TimedProver:
             length /= 2.0
 
     def _fault_in(self, motion: Trajectory, start: float, end: float) -> str:
-        """Return why what the dynamic obstacles sweep from a moment to another is in the way, or nothing."""
+        """Return the contact with the volume that the dynamic obstacles sweep in a slice of time, or nothing."""
         exact = self._exact_among(end - start)
         for o in self.obstacles:
             exact.move(o.name, obstacle_at(o, 0.5 * (start + end)).position)
@@ -132,7 +136,7 @@ class TimedProver:
         return exact.prove(curve, tolerance=0.0).reason
 
     def _exact_among(self, length: float) -> CollisionChecker:
-        """Return a checker among the dynamic obstacles, as large as what they sweep in slices of a length [s]."""
+        """Return a checker among the volumes that the dynamic obstacles sweep in slices of a length [s]."""
         if length not in self._exact:
             swept = [inflated(o, self._margin + 0.5 * length * self._speeds[o.name]) for o in self.obstacles]
             pairs = [pair for pair in self._allowed if not any(map(self._checker.is_obstacle, pair))]
@@ -190,11 +194,11 @@ def check_timed_path(
     Between states the path is straight and its velocity constant. Time is divided where a script has a place or an
     obstacle appears, and these pieces into intervals in which no obstacle moves more than ``OBSTACLE_STEP``. In each,
     the obstacles stand where they are in its middle, inflated by half of ``OBSTACLE_STEP``, and so contain all that
-    they sweep; the path of that time is proved free of them. One that appears when the path ends is not looked at.
+    they sweep; the path of that time is proved free of them. One that appears when the path ends is not checked.
 
     Args:
         robot: The robot.
-        problem: The problem, with obstacles as they are from time 0 on, and held objects.
+        problem: The problem, with the motions of its obstacles from time 0 on, and held objects.
         path: States, shape (N, dof).
         times: Times of the states, increasing from 0, shape (N,) [s].
 

@@ -1,4 +1,7 @@
-"""Optimization in space and time: splines in time among dynamic obstacles, from a moving start to rest at a goal."""
+"""Optimization in space and time: splines in time among dynamic obstacles, and a pool of candidates.
+
+A motion starts from a moving state and ends at rest at a goal.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from apex_ompl.timing.spline_method import least_knot_spacing, spline_in_time, s
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive
 
-PINNED = 3  # control points at each end that say where and how a motion starts and ends
+PINNED = 3  # control points at each end, which are fixed by the state there
 KNOT_SPACING = 0.1  # aimed at [s]
 LEAST_SPANS, MOST_SPANS = 8, 40
 ROUNDS = 4  # rounds of steps of a repair, between which a motion over its limits gets more time
@@ -46,7 +49,7 @@ class MotionSettings:
         scene_margin: Clearance to obstacles and dynamic obstacles below which a sample costs [m].
         own_margin: Clearance between the robot's own links below which a sample costs [m].
         stiffness: Weight of half the integral of the speed squared over the share of the motion [1/rad^2].
-        limit_weight: Weight of half the square of what a limit is exceeded by, as a share of it.
+        limit_weight: Weight of half the square of the excess over a limit, as a share of it.
         limit_share: Share of the limits above which there is a cost.
         damping: Weight of the speed of the change at the first step.
         steps: Largest number of steps of a round.
@@ -65,7 +68,7 @@ class MotionSettings:
 
 
 class Start(NamedTuple):
-    """What a robot does when a motion starts: position, velocity and acceleration, each of shape (dof,)."""
+    """State in which a motion starts: position, velocity and acceleration, each of shape (dof,)."""
 
     position: Array
     velocity: Array
@@ -83,12 +86,12 @@ class Start(NamedTuple):
 
 
 class TimedSpline(NamedTuple):
-    """A uniform cubic B-spline in time, which starts in a given way and ends at rest.
+    """A uniform cubic B-spline in time, from a given state to rest.
 
     Attributes:
-        control: Control points, shape (P, dof) [rad]; the first three say how it starts, the last three are the goal.
+        control: Control points, shape (P, dof) [rad]; the first three fix the start, the last three are the goal.
         spacing: Knot spacing [s].
-        start: How it starts.
+        start: State in which it starts.
     """
 
     control: Array
@@ -105,10 +108,10 @@ class TimedSpline(NamedTuple):
         """Return the spline whose control points are states of a motion, evenly spaced in time.
 
         Args:
-            states: States of the motion, evenly spaced in time, shape (N, dof); from a moving start they start as that.
+            states: States of the motion, evenly spaced in time, shape (N, dof); the first is the start.
             duration: Its duration [s]; the spline takes a knot spacing longer, since it rounds the end, and another one
                 from rest.
-            start: How the spline starts.
+            start: State in which the spline starts.
             goal: Where it ends, shape (dof,).
 
         Raises:

@@ -162,7 +162,7 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     world = worlds.load(name)
     setup = assemble(world.problem.still)
     context = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
-    dynamic, standing = DynamicObstacles(world.present(0.0)), Following.standing(setup.start, 0.0, context.names)
+    dynamic, standing = DynamicObstacles(world.present(0.0)), Following.resting(setup.start, 0.0, context.names)
     search = Search(context, Request(1, 0.0, 0.05, standing, None, dynamic, dynamic, (), np.inf, 0), ComputeBudget(0.1))
     control, horizon = PathIntegral(), Horizon(context.limits)
     points = horizon.roll(search.start, control.tried(search, horizon))
@@ -237,7 +237,7 @@ def trees() -> dict[str, float]:
             RRTConnectFromRest(),
         )
         source.prepare(context)
-        dynamic, standing = DynamicObstacles(present), Following.standing(setup.start, 0.0, context.names)
+        dynamic, standing = DynamicObstacles(present), Following.resting(setup.start, 0.0, context.names)
         search = Search(
             context, Request(2, 0.0, 0.05, standing, None, dynamic, dynamic, present, np.inf, 0), ComputeBudget(0.1)
         )

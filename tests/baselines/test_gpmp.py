@@ -219,7 +219,7 @@ def test_the_replanner_begins_as_the_robot_moves(kind: type[IncrementalGPMP2]) -
     replanner = kind()
     replanner.prepare(context)
     dynamic = DynamicObstacles([Obstacle(name="far", box=(0.1,) * 3, position=(2.0, 2.0, 1.0))])
-    standing = Following.standing(context.setup.start, 0.0, context.names)
+    standing = Following.resting(context.setup.start, 0.0, context.names)
 
     def ask(following: Following, route: Following | None, join: float) -> tuple[Following, ComputeBudget]:
         budget = ComputeBudget(0.2)

@@ -256,7 +256,7 @@ def test_a_replan_begins_as_the_robot_moves_and_is_charged_by_chunks(straight: P
     context = context_of(PROBLEM, **named("il").settings)
     method = Imitation(str(straight), steps=16)
     method.prepare(context)
-    begin, moving = 0.0, Following.standing(context.setup.start, 0.0, context.names)
+    begin, moving = 0.0, Following.resting(context.setup.start, 0.0, context.names)
     for number in range(1, 5):
         join, budget = begin + 0.1, ComputeBudget(SHARE * context.settings.budget)
         nothing = DynamicObstacles(())

@@ -214,7 +214,7 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
     """The second of three requests takes its ten seconds; the third is answered at once, and ends it."""
     context, world = context_of(PROBLEM, budget=10.0), world_of(PROBLEM)
     work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, ("busy", ""), 0)
-    standing = Following.standing(context.setup.start, 0.0, context.names)
+    standing = Following.resting(context.setup.start, 0.0, context.names)
     started, spent = time.monotonic(), []
     with PlannerProcess(work) as process:
         for number in (1, 2, 3):
@@ -231,7 +231,7 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
 def test_a_process_that_reads_nothing_holds_nobody_up() -> None:
     context, world = context_of(PROBLEM), world_of(PROBLEM)
     work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, ("never",), 0)
-    standing = Following.standing(context.setup.start, 0.0, context.names)
+    standing = Following.resting(context.setup.start, 0.0, context.names)
     large = DynamicObstacles([]).larger(0.0)
     first = Request(1, 0.0, 0.05, standing, None, large, large, (), np.inf, 0)
     with PlannerProcess(work) as process:

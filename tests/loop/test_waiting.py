@@ -43,7 +43,7 @@ def search_of(
     budget: float = 0.05,
 ) -> Search:
     """A replan of a robot that stands, at the start unless elsewhere, and for which none was found before."""
-    standing = Following.standing(context.setup.start if at is None else at, 0.0, context.names)
+    standing = Following.resting(context.setup.start if at is None else at, 0.0, context.names)
     dynamic = DynamicObstacles(obstacles)
     request = Request(2, 0.0, 0.05, standing, None, dynamic, 0.0, obstacles, conflict, 0)
     return Search(context, request, ComputeBudget(budget))
@@ -66,7 +66,7 @@ def test_a_robot_waits_on_the_way_to_a_goal_that_is_blocked(context: RunContext)
 
 def clear_at(context: RunContext, search: Search, q: np.ndarray) -> bool:
     """Whether a robot may stand at a state for as long as is asked of it."""
-    one = Following.standing(q, search.request.join, context.names)
+    one = Following.resting(q, search.request.join, context.names)
     until = search.request.join + context.settings.rest_hold + 1.0
     return bool(np.isinf(context.first_conflict(search.request.predicted, one, search.request.join, until)))
 

@@ -88,7 +88,7 @@ def test_a_motion_behind_another_one_joins_it(share: float) -> None:
 @settings(max_examples=20)
 @given(st.lists(st.integers(0, 120), min_size=1, max_size=5, unique=True))
 def test_what_was_executed_is_what_was_followed(ticks: list[int]) -> None:
-    standing = Following.standing(robot().home, 0.0, robot().joint_names)
+    standing = Following.resting(robot().home, 0.0, robot().joint_names)
     followed = [(0.0, standing), (0.3, Following(motion(), 0.3))]
     for tick in sorted(ticks):  # a stop from wherever the robot is, and another one from that
         time = 0.3 + 0.01 * tick
@@ -115,9 +115,9 @@ def test_motions_shorter_than_a_tick() -> None:
     assert 0.0 < short.duration < 0.01
     following = Following(short, 0.02)
     check(following.piece(0.02, 0.03), lambda t: values(following, t), 0.02, 0.03)
-    found = executed([(0.0, Following.standing(home, 0.0, names)), (0.02, following)], 0.05)
+    found = executed([(0.0, Following.resting(home, 0.0, names)), (0.02, following)], 0.05)
     assert found.duration == pytest.approx(0.05) and np.array_equal(found.positions[-1], there)
-    still = Following.standing(home, 1.0, names)
+    still = Following.resting(home, 1.0, names)
     assert still.end == 1.0 and still.at_rest(1.0) and np.array_equal(still.piece(1.0, 1.01).positions, [home, home])
     nothing = executed([(0.0, still)], 0.0)
     assert nothing.duration == 0.0 and np.array_equal(nothing.positions, [home])
