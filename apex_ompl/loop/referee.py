@@ -131,7 +131,7 @@ def judge(
     Args:
         robot: The robot.
         problem: The problem, with the scripts of the moving obstacles.
-        trajectory: The executed motion from time 0 on; after its end the robot stands.
+        trajectory: The executed motion from time 0 on; after its end the robot is at rest.
         end: When the run ended [s], by default with the motion.
         goals: States of which the motion is to end in one, shape (N, dof); by default the goal of the problem.
         limits: Limits that are to be kept, by default the robot's.

@@ -259,7 +259,7 @@ class RunContext:
             spread: Difference of places from predicted ones, beyond the assumed error [m].
 
         Returns:
-            Their number; and of how many of those looked at the stop is one of each joint by itself.
+            Their number; and the number of joint-by-joint stops among the checked ones.
         """
         settings = self.settings
         error, fastest = settings.assumed

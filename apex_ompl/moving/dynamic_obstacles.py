@@ -34,8 +34,8 @@ PREPARED = 64  # motions whose curves are kept
 class DynamicObstacles:
     """Dynamic obstacles at constant velocity without rotation, beside the scene of a kernel.
 
-    Each has a place and a velocity at a time stamp, and a margin by which it counts as larger, which may grow behind
-    the time stamp. An update is a write to an array.
+    Each has a position and a velocity at a time stamp, and a margin by which it counts as larger, which may grow after
+    the time stamp. An update writes to arrays.
 
     Attributes:
         names: Names of the obstacles.
@@ -223,9 +223,9 @@ def prove_motion(
 ) -> Conflict:  # fmt: skip
     """Check a timed motion continuously among dynamic obstacles, and find the first moment that is not proved clear.
 
-    The proof is that of the sphere covers along the motion's own cubic pieces
-    (:mod:`apex_ompl.kernel.compiled.dynamic_obstacles`): it is sound, and may leave contacts of some millimeters open
-    that there are not. The scene of the kernel and the robot itself are not looked at.
+    The check is that of the sphere covers along the motion's own cubic pieces
+    (:mod:`apex_ompl.kernel.compiled.dynamic_obstacles`): it is sound and conservative by some millimeters. The scene of
+    the kernel and self-collision are not checked.
 
     Args:
         kernel: The kernel of the robot with its held objects.

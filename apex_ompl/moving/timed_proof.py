@@ -1,4 +1,4 @@
-"""Continuous collision checks in time: of timed motions by spheres and exact shapes, and of timed paths by swept shapes.
+"""Continuous collision checks in time: timed motions by spheres and exact shapes, timed paths by swept shapes.
 
 Obstacles move from time 0 on, when the motion or the path starts, at constant velocity or by a script
 (:mod:`apex_ompl.scene.scripts`).
@@ -26,7 +26,7 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_states, check_times, number_array
 
-SLICE, SHORTEST_SLICE = 0.02, 0.00125  # of time, in which exact shapes are looked at [s]
+SLICE, SHORTEST_SLICE = 0.02, 0.00125  # lengths of slices of time that are checked by exact shapes [s]
 INFLATED = ("box", "sphere", "cylinder", "capsule")
 SHORTEST_STEP = 0.01  # time between two states of a path [s]
 MAX_INTERVALS = 1_000_000

@@ -150,7 +150,7 @@ class MotionOptimizer:
     The cost is that of :mod:`apex_ompl.kernel.compiled.motion_optimization`.
 
     Attributes:
-        samples: Number of samples that steps have looked at so far.
+        samples: Number of samples of all steps so far.
     """
 
     def __init__(

@@ -21,30 +21,30 @@ SHARES = np.array([0.0, 0.25, 0.5, 1.0])  # of the largest speed, of rollouts th
 class PathIntegral:
     """Model predictive path integral control (Williams et al. 2017) in joint space, as STORM has it (Bhardwaj et al.).
 
-    Rollouts are noise around the controls of the replan before, shifted to the time of joining; beside them are a stop,
-    and straight ways to the nearest goal at several speeds. A rollout costs what its states
-    are away from the nearest goal, and what they are nearer than a berth to obstacles when these are there, to what
-    stands still, and to the robot itself. The mean, weighted by the softmax of the costs, is followed by a stop and
-    proved; where the whole horizon is not, a shorter part of it is tried.
+    Rollouts are noise around the controls of the last replan, shifted to the time of joining; besides, there are a stop
+    and straight rollouts to the nearest goal at several speeds. The cost of a rollout is the distance of its states from
+    the nearest goal, and their violation of the clearance margins: to dynamic obstacles at the time of the state, to
+    static obstacles and to the robot itself. The mean, weighted by the softmax of the costs, is followed by a stop and
+    proved; where the whole horizon is not proved, a shorter part of it is tried.
 
     512 rollouts of 20 steps take about 28 ms by the compute-cost table, since static obstacles and the robot itself are
-    looked at in every fourth state only. Three sets of parameters were tried in 4 to 8 worlds of each of the kinds
+    checked at every fourth state only. Three sets of parameters were tried in 4 to 8 worlds of each of the kinds
     ``moving``, ``popup`` and ``interceptor`` of the validation split.
 
     Attributes:
         rollouts: Number of rollouts.
-        steps: Number of steps of a rollout, the stop at its end among them.
+        steps: Number of steps of a rollout, including the stop at its end.
         step: Time of a step [s].
         knots: Number of values of the noise of a joint over the horizon, between which it is linear.
         noise: Least and largest standard deviation of the accelerations of a rollout, as shares of the largest.
-        temperature: Of the softmax, in units of the cost.
+        temperature: Temperature of the softmax, in units of the cost.
         clearance_margin: Clearance to dynamic obstacles below which a state costs [m].
-        own_margin: The same to static obstacles and between bodies of the robot [m].
+        own_margin: Clearance to static obstacles and between bodies of the robot below which a state costs [m].
         collision: Cost of contact for a second, in rad of distance for a second.
         effort: Weight of the accelerations squared, as shares of the largest.
-        sparse: States of a rollout are looked at for static obstacles at every so manieth step.
-        counts: Numbers of steps of which a proof is tried.
-        near: Distance of any joint to a goal from which on the straight motion to it is tried first [rad].
+        sparse: Number of steps between two states that are checked for static obstacles.
+        counts: Numbers of steps for which a proof is tried.
+        near: Distance to a goal, of the farthest joint, below which the straight motion to it is tried first [rad].
     """
 
     rollouts: int = 512
@@ -68,7 +68,7 @@ class PathIntegral:
         self.controls = None
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
-        """Return the motion of the mean of the rollouts, or a straight one to a goal that is near."""
+        """Return the motion of the mean of the rollouts, or a straight one to a near goal."""
         search = Search(context, request, budget)
         if not len(search.goals):
             return Answer(None, "", budget)
@@ -135,7 +135,7 @@ class PathIntegral:
         return horizon.steer(search.start, (self.steps, len(SHARES)), control)
 
     def _shifted(self, join: float, dof: int) -> Array:
-        """Return the controls of the replan before from a time of joining on, shape (K, dof)."""
+        """Return the controls of the last replan from a time of joining on, shape (K, dof)."""
         if self.controls is None:
             return np.zeros((self.steps, dof))
         at = np.arange(self.steps) + (join - self.started) / self.step
@@ -144,10 +144,10 @@ class PathIntegral:
 
 
 def near_clearance(search: Search, states: Array, clearance_margin: float, near: float) -> Array:
-    """Return clearances of states to static obstacles and of the robot to itself [m], up to a berth, shape (N,).
+    """Return the clearance of states to static obstacles and of the robot to itself [m], up to a margin, shape (N,).
 
-    Where what is held may be closer at the nearest goal, that of the robot to itself counts from there, as far as a
-    state is nearer than ``near`` to the goal [rad].
+    Held objects may be closer to each other at the nearest goal: within ``near`` of the goal [rad], the robot's own
+    clearance counts in relation to that at the goal.
     """
     goal = search.goals[0]
     found = search.context.kernel.clearance(np.concatenate([goal[None], states]), clearance_margin)
@@ -164,7 +164,7 @@ def softmax(costs: Array, temperature: float) -> Array:
 
 
 def depth(clearance: Array, clearance_margin: float) -> Array:
-    """Return how deep clearances are in a berth: 0 at its edge, 1 in contact, and 4 and more a berth below that."""
+    """Return the cost max(1 - c / m, 0)^2 of clearances c for a clearance margin m: 0 at m, and 1 in contact."""
     deep: Array = np.maximum(1.0 - np.nan_to_num(clearance, nan=-clearance_margin) / clearance_margin, 0.0) ** 2
     return deep
 

@@ -24,12 +24,11 @@ PLANNER = "damon"
 class DamonReplanner:
     """The planner ``damon`` in the loop: :class:`~apex_ompl.baselines.damon.latent_graph.Damon` with its defaults.
 
-    Which nodes are free of static obstacles is found before a run, and which edges when they are first used in it. At
-    each replan, nodes that an obstacle hits where it stands when the new motion starts are left out, and A* finds a
-    path over the rest. It is made shorter between its nodes, timed, and proved among the obstacles as they are
-    predicted.
+    Nodes are checked for static obstacles before a run, edges when they are first used in it. At each replan, nodes
+    that an obstacle hits at its place when the new motion starts are left out, and A* finds a path over the others. It
+    is shortened between its nodes, timed, and proved among the predicted obstacles.
 
-    It plans from rest: while the robot will be moving at the time of joining it answers nothing.
+    It plans from rest: it returns nothing while the robot will be moving at the time of joining.
 
     Attributes:
         damon: The graph, from :meth:`prepare` on.
@@ -94,14 +93,14 @@ class DamonReplanner:
         return Answer(search.following(motion) if search.accepts(motion) else None, "graph", budget)
 
     def _blocked_from(self, start: Array) -> set[Motion]:
-        """Return the motions that static obstacles is known to block; those from other starts are forgotten."""
+        """Return the motions that static obstacles are known to block; those from other starts are forgotten."""
         key = start.tobytes()
         if key != self._start:
             self._start, self._blocked = key, {one for one in self._blocked if one[0] != "start"}
         return self._blocked
 
     def _is_free(self, clear: Clearances, first: Array, last: Array) -> bool:
-        """Whether a straight motion is clear after its first state; that is proved once of static obstacles."""
+        """Whether a straight motion is clear after its first state; static obstacles are checked once."""
         key = first.tobytes() + last.tobytes()
         if not self._clear_of_static.get(key, True) or not clear.edges_of_dynamic(first[None], last[None])[0]:
             return False

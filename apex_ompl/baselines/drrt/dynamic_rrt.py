@@ -12,7 +12,7 @@ from apex_ompl.types import Array, Flags, Indices
 AreFree = Callable[[Array, Array], Flags]
 """Whether straight motions are free, shape (N,), from states of shape (N, dof) to states of shape (N, dof)."""
 
-FIRST_ROOM = 1024  # nodes that there is room for at first
+FIRST_ROOM = 1024  # initial capacity in nodes
 
 
 class GoalTree:
@@ -50,7 +50,7 @@ class GoalTree:
 
     @property
     def full(self) -> bool:
-        """Whether there is room for no more."""
+        """Whether the tree has its largest number of nodes."""
         return self._count == self._most
 
     @property
@@ -114,21 +114,21 @@ class GoalTree:
 class DynamicRRT:
     """Dynamic RRT (Ferguson, Kalra and Stentz 2006, "Replanning with RRTs"; Connell and La 2017 compare with it).
 
-    The tree is rooted at the goals, so that it stays of use while the robot moves. Before it is grown again, edges that
-    are no longer free are removed with all after them. It grows until it has a start: towards a start, towards states
-    of the last path (the way-point cache of Bruce and Veloso 2002, "Real-time randomized path planning for robot
-    navigation"), or towards random states. Without a last path these take the place of way-points, and what is left is
-    RRT from the goal.
+    The tree is rooted at the goals, so that it stays useful while the robot moves. Before it is grown again, edges that
+    are no longer free are removed with their descendants. It grows until it has a start: towards a start, towards
+    states of the last path (the way-point cache of Bruce and Veloso 2002, "Real-time randomized path planning for robot
+    navigation"), or towards random states. Without a last path random states replace way-points, which is RRT from the
+    goal.
 
-    The paper leaves open how long steps are, the distance (here Euclidean, steps by the largest change of a joint), how
-    many way-points are kept (here the nodes of the last path), several goals (here roots alike), and a tree that is
-    long kept (here it may be bounded, and then starts anew).
+    The paper leaves open the length of steps, the distance (here Euclidean, steps by the largest change of a joint),
+    the number of way-points (here the nodes of the last path), several goals (here all are roots), and the size of a
+    tree over many calls (here it may be bounded, and then is built again).
 
     Attributes:
         step: Largest length of an edge [rad, max-norm].
         to_start: Share of the extensions towards a start.
         to_waypoint: Share of those towards states of the last path.
-        most: Number of nodes from which on the tree starts anew; None for any number.
+        most: Number of nodes at which the tree is built again; None for any number.
         tree: The tree, or None.
         waypoints: Nodes of the last path, shape (L, dof), or None.
     """
@@ -145,7 +145,7 @@ class DynamicRRT:
         self.tree, self.waypoints = None, None
 
     def rooted_at(self, goals: Array) -> GoalTree:
-        """Return the tree of goals, shape (goals, dof): the one that is kept, or a new one where these are others."""
+        """Return the tree of goals, shape (goals, dof): the kept one, or a new one where the goals changed."""
         tree = self.tree
         if tree is None or tree.full or not np.array_equal(tree.states[: tree.roots], goals):
             tree = self.tree = GoalTree(goals, self.step, self.most)

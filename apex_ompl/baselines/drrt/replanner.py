@@ -1,4 +1,4 @@
-"""Replanning with a tree that is kept: dynamic RRT."""
+"""Replanning with a kept tree: dynamic RRT."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ SEEN = 0.01  # clearances beyond this are not told apart [m]
 class DynamicRRTReplanner:
     """The planner ``drrt`` in the loop: :class:`apex_ompl.baselines.drrt.dynamic_rrt.DynamicRRT`, kept over a run.
 
-    At each replan, nodes whose edges meet an obstacle where it stands when the new motion starts are removed with all
-    after them, and the tree grows until it reaches the robot. Its path is made shorter between its nodes, timed, and
-    proved among the obstacles as they are predicted.
+    At each replan, nodes whose edges meet an obstacle at its place when the new motion starts are removed with their
+    descendants, and the tree grows until it reaches the robot. Its path is shortened between its nodes, timed, and
+    proved among the predicted obstacles.
 
-    It plans from rest: while the robot will be moving at the time of joining it answers nothing. Two sets
-    of parameters were tried in 5 to 20 worlds of each of the kinds ``moving``, ``popup`` and ``interceptor`` of the
-    validation split. Longer steps, which are better where obstacles stand, are no better here: at a quarter of the
-    velocity limits runs with steps of 0.3, 0.7 and 1.4 rad fail in 7, 9 and 8 of the same 23 worlds ``moving``.
-    Proved as if obstacles stood, its motions reach a goal in 10 of 24 other worlds; among what is predicted, in 9.
+    It plans from rest: it returns nothing while the robot will be moving at the time of joining. Two sets of parameters
+    were tried in 5 to 20 worlds of each of the kinds ``moving``, ``popup`` and ``interceptor`` of the validation split.
+    Longer steps, which are better among static obstacles, are no better here: at a quarter of the velocity limits, runs
+    with steps of 0.3, 0.7 and 1.4 rad fail in 7, 9 and 8 of the same 23 worlds ``moving``. Proved as if obstacles were
+    at rest, its motions reach a goal in 10 of 24 other worlds; among predicted obstacles, in 9.
 
     Attributes:
         search: The tree, and how it grows.
@@ -64,7 +64,7 @@ class DynamicRRTReplanner:
         return Answer(search.following(motion) if search.accepts(motion) else None, "tree", budget)
 
     def _grown(self, search: Search, tree: GoalTree, clear: Clearances) -> Array | None:
-        """Grow the tree until it has the robot's state; return its path, or None where time is up."""
+        """Grow the tree until it has the robot's state; return its path, or None where the time is up."""
         start, rng, robot = search.start.position, search.rng, search.context.setup.robot.limits
         fingers = search.context.fingers
 
@@ -78,7 +78,7 @@ class DynamicRRTReplanner:
 
 
 def timed(search: Search, path: Array, clear: Clearances) -> Trajectory | None:
-    """Return the motion along a path made shorter, or None where there is no time for it any more."""
+    """Return the motion along the shortened path, or None where the budget is used up."""
     short, budget = shortened(path, clear), search.budget
     kind = "straight motion" if len(short) == 2 else "path in time"
     if budget.spent + cost_table()["seconds"][kind] > budget.limit:
@@ -89,7 +89,7 @@ def timed(search: Search, path: Array, clear: Clearances) -> Trajectory | None:
 
 @dataclass(frozen=True, eq=False)
 class Clearances:
-    """Which states are clear of static obstacles, of the robot itself, and of obstacles where they are at joining.
+    """Collision checks of states: static obstacles, self-collision, and dynamic obstacles at the time of joining.
 
     Attributes:
         search: The replan.
@@ -98,13 +98,13 @@ class Clearances:
     search: Search
 
     def __call__(self, states: Array) -> Flags:
-        """Return whether each state, shape (N, dof), is clear of all."""
+        """Return whether each state, shape (N, dof), passes all checks."""
         clear = self.of_dynamic(states)
         clear[clear] = self.of_static(states[clear])
         return clear
 
     def of_static(self, states: Array) -> Flags:
-        """Return whether each state, shape (N, dof), is clear of static obstacles, and of the robot itself."""
+        """Return whether each state, shape (N, dof), is clear of static obstacles and self-collision."""
         context = self.search.context
         own = context.kernel.clearance(states, SEEN).min(axis=1)
         self.search.budget.spend("near clearance", len(states))
@@ -115,16 +115,16 @@ class Clearances:
         return clear
 
     def edges(self, first: Array, last: Array) -> Flags:
-        """Return whether straight motions, between states of shape (N, dof), are clear behind their first state."""
+        """Return whether straight motions, between states of shape (N, dof), are clear after their first state."""
         return self._along(first, last, self)
 
     def line(self, first: Array, last: Array) -> bool:
-        """Whether a straight motion is proved clear of static obstacles, and looked at in steps, of obstacles."""
+        """Whether a straight motion is proved clear of static obstacles, and in steps clear of dynamic ones."""
         seen = self.edges_of_dynamic(first[None], last[None])[0]
         return bool(seen) and self.search.context.line_is_clear(first, last, self.search.budget)
 
     def edges_of_dynamic(self, first: Array, last: Array) -> Flags:
-        """Return whether straight motions are clear of obstacles where they are at joining behind their first state."""
+        """Return whether straight motions are clear of dynamic obstacles at joining, after their first state."""
         return self._along(first, last, self.of_dynamic)
 
     def _along(self, first: Array, last: Array, clear: Callable[[Array], Flags]) -> Flags:
@@ -137,7 +137,7 @@ class Clearances:
         return np.asarray(np.logical_and.reduceat(clear(np.concatenate(pieces)), firsts))
 
     def of_dynamic(self, states: Array) -> Flags:
-        """Return whether each state, shape (N, dof), is clear of obstacles where they are at joining."""
+        """Return whether each state, shape (N, dof), is clear of dynamic obstacles at the time of joining."""
         context, request = self.search.context, self.search.request
         times = np.full(len(states), request.join)
         clear: Flags = clearance_in_time(context.kernel, request.predicted, states, times, SEEN)[0] > 0.0
@@ -146,7 +146,7 @@ class Clearances:
 
 
 def shortened(path: Array, clear: Clearances) -> Array:
-    """Return a path without the states that clear straight lines pass by, each as far along as bisection finds one."""
+    """Return a path with shortcuts: from each state a clear straight line to the farthest one that bisection finds."""
     found, at = [path[0]], 0
     while at < len(path) - 1:
         low, high, tried = at + 1, len(path), len(path) - 1

@@ -165,7 +165,7 @@ class FactorGraph(Factors):
     def _matrix(self, gram: Array) -> BlockTridiagonal:
         """Return the Gauss-Newton matrix of all factors from that of the checked states, shape (K, dof, dof)."""
         count, dof = self.process.intervals, gram.shape[1]
-        before, behind = self.weights[:, 0, 0], self.weights[:, 0, 1]
+        before, after = self.weights[:, 0, 0], self.weights[:, 0, 1]
         flat = gram.reshape(count, self.checked, dof * dof)
 
         def blocks(first: Array, second: Array, chosen: Array) -> Array:
@@ -175,8 +175,8 @@ class FactorGraph(Factors):
 
         prior, eye = self.process.inner_precision, np.eye(dof)
         diagonal = np.kron(prior.diagonal[0], eye) + blocks(before, before, flat[1:])
-        diagonal += blocks(behind, behind, flat[:-1])
-        upper = blocks(before, behind, flat[1:-1])
+        diagonal += blocks(after, after, flat[:-1])
+        upper = blocks(before, after, flat[1:-1])
         if len(upper):
             upper += np.kron(prior.upper[0], eye)
         return BlockTridiagonal(diagonal, upper)
@@ -188,7 +188,7 @@ class FactorGraph(Factors):
         """Return the maximum of the posterior that Levenberg-Marquardt steps find.
 
         The damping, a share of the diagonal, falls to a tenth after a step that lowers the cost, and grows tenfold
-        behind one that does not.
+        after one that does not.
 
         Args:
             supports: Where to start, shape (N + 1, 2, dof).
@@ -242,7 +242,7 @@ class CostFunctional(Factors):
         """Return supports whose positions are brought within the limits, smoothly: CHOMP's projection (2009).
 
         Where a joint exceeds a limit it is moved by the column of K of its worst support, until none exceeds any; what
-        is left behind some rounds is cut off.
+        is left after some rounds is clipped.
         """
         covariance, found = self.process.inner_covariance, supports.copy()
         inner = found[1:-1].reshape(-1, found.shape[2])  # a view

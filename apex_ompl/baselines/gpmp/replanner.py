@@ -1,4 +1,4 @@
-"""Replanning on a Gaussian-process prior: GPMP and GPMP2 from the state that the robot will be in."""
+"""Replanning on a Gaussian-process prior: GPMP and GPMP2 from the state that the robot will have."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.types import Array
 
 WORK = "state of a factor graph"
-KNOT_SPACING = 0.08  # that is aimed at [s]
-SLOWER = 1.01  # factor on the duration of a motion that exceeds its limits, beyond what its own shape asks for
+KNOT_SPACING = 0.08  # aimed at [s]
+SLOWER = 1.01  # factor on the duration that the limits require of a motion that exceeds them
 
 
 @dataclass(eq=False)
 class IncrementalGPMP2:
-    """GPMP2 anew at each replan, from where the last one ended, as iGPMP2 does (Mukadam et al., IJRR 2018).
+    """GPMP2 at each replan, warm-started from the last motion, as iGPMP2 does (Mukadam et al., IJRR 2018).
 
     The first support is the state that the robot will have when the new motion starts, with its velocity; the last one
-    is a goal, at rest. Levenberg-Marquardt steps start at the rest of the last motion to a goal, and then at straight
-    lines to the nearest goals. Dynamic obstacles are looked at where they will be at the time of each state.
+    is a goal, at rest. Levenberg-Marquardt steps start at the remaining motion to a goal, and then at straight lines to
+    the nearest goals. Clearances to dynamic obstacles are those at the time of each state.
 
-    What the papers leave open, or is done otherwise: iGPMP2 updates one Bayes tree (iSAM2), here the few steps of a
-    replan solve the whole block-tridiagonal system, which is small. Its duration is fixed; here it is that of the
-    motion to start from without obstacles, times each of ``factors``, and longer where limits ask for it, with
-    obstacles at their new times then. Its states know no acceleration; the motion that is followed is the cubic
-    B-spline in time whose control points are states of the solution: it starts as the robot moves, keeps the limits,
-    and is proved. The prior's power is that of the planner ``gpmp2`` over the duration cubed.
+    Left open by the papers, or done otherwise: iGPMP2 updates one Bayes tree (iSAM2); here the few steps of a replan
+    solve the whole block-tridiagonal system, which is small. Its duration is fixed; here it is that of the initial
+    motion without obstacles, times each of ``factors``, and longer where limits require it, with obstacles at the new
+    times then. Its states have no acceleration; the robot follows the cubic B-spline in time whose control points are
+    states of the solution: it starts in the robot's state, keeps the limits, and is proved. The prior's power is that
+    of the planner ``gpmp2`` over the duration cubed.
 
     Attributes:
-        parameters: Those of the planner.
-        factors: Durations that are tried, as multiples of what a path takes without obstacles.
-        iterations: Most motions that are tried in a round.
-        rounds: Most rounds, between which a motion gets more time.
-        goals: Number of goals that straight lines lead to.
+        parameters: Parameters of the planner.
+        factors: Durations that are tried, as multiples of the shortest one without obstacles.
+        iterations: Largest number of motions that are tried in a round.
+        rounds: Largest number of rounds, between which a motion gets more time.
+        goals: Number of goals of straight lines.
     """
 
     parameters: GaussianProcessParameters = GPMP2(intervals=10, checked=4, tolerance=1e-2)
@@ -60,7 +60,7 @@ class IncrementalGPMP2:
         clearance_costs(context.kernel, context.setup.start, 0.01, 0.01)
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
-        """Return the first motion that is proved among what is expected, or none."""
+        """Return the first motion that is proved among the predicted obstacles, or none."""
         search = Search(context, request, budget)
         for part, initial in self.initial_motions(search):
             for factor in self.factors:
@@ -72,7 +72,7 @@ class IncrementalGPMP2:
         return Answer(None, "", budget)
 
     def initial_motions(self, search: Search) -> Iterator[tuple[str, InitialMotion]]:
-        """Yield motions to start from, and what they are."""
+        """Yield initial motions, and their names."""
         limits, rest = search.context.limits, rest_of_route(search)
         if rest is not None:
             yield "route", InitialMotion(rest, rest[-1], shortest_duration(rest, limits))
@@ -81,7 +81,7 @@ class IncrementalGPMP2:
             yield "line", InitialMotion(line, goal, shortest_duration(line, limits))
 
     def motion(self, search: Search, initial: InitialMotion, duration: float) -> Trajectory | None:
-        """Return a proved motion that is about as long as asked for [s], or longer where limits ask for it, or None."""
+        """Return a proved motion of about a duration [s], or a longer one where limits require it, or None."""
         supports, limits = self.supports(search, initial, duration), search.context.limits
         for _ in range(self.rounds):
             problem = self.problem(search, duration)
@@ -104,7 +104,7 @@ class IncrementalGPMP2:
         return None
 
     def supports(self, search: Search, initial: InitialMotion, duration: float) -> Array:
-        """Return supports to start from, shape (N + 1, 2, dof)."""
+        """Return the supports of an initial motion, shape (N + 1, 2, dof)."""
         count = self.parameters.intervals + 1
         wanted, at = np.linspace(0.0, len(initial.states) - 1.0, count), np.arange(len(initial.states))
         positions = np.stack([np.interp(wanted, at, column) for column in initial.states.T], axis=1)
@@ -114,16 +114,16 @@ class IncrementalGPMP2:
         return np.stack([positions, velocities], axis=1)
 
     def problem(self, search: Search, duration: float) -> Any:
-        """Return what is optimized, of motions that last so long [s]: the factor graph."""
+        """Return the factor graph of motions of a duration [s]."""
         return FactorGraph(*self.terms(search, duration))
 
     def optimum(self, problem: Any, supports: Array, stop: Callable[[], bool]) -> Optimum:
-        """Return what supports come to."""
+        """Return the optimum from some supports."""
         found: Optimum = problem.maximum(supports, self.iterations, self.parameters.tolerance, stop=stop)
         return found
 
     def terms(self, search: Search, duration: float) -> tuple[Any, ...]:
-        """Return what :class:`apex_ompl.baselines.gpmp.optimizer.Factors` takes, of motions that last so long [s]."""
+        """Return the arguments of :class:`apex_ompl.baselines.gpmp.optimizer.Factors` for a duration [s]."""
         p, request, kernel, limits = self.parameters, search.request, search.context.kernel, search.context.limits
         process = GaussianProcess(p.intervals, duration, p.power / duration**3)
 
@@ -139,20 +139,20 @@ class IncrementalGPMP2:
 class IncrementalGPMP(IncrementalGPMP2):
     """GPMP in the same way: steps along the functional gradient, up to the first motion that is clear at its states.
 
-    The paper (Mukadam, Yan and Boots, ICRA 2016) plans once; that it is started anew from the moving robot and where the
-    last motion ended, is as in :class:`IncrementalGPMP2`. With 10, 20 or 40 iterations, and tolerances of 1e-3 or
-    1e-2, it fails in 2 of 16 validation worlds.
+    The paper (Mukadam, Yan and Boots, ICRA 2016) plans once; the warm start from the moving robot is that of
+    :class:`IncrementalGPMP2`. With 10, 20 or 40 iterations, and tolerances of 1e-3 or 1e-2, it fails in 2 of 16
+    validation worlds.
     """
 
     parameters: GPMP = GPMP(intervals=10, checked=4, tolerance=1e-3)
     iterations: int = 20
 
     def problem(self, search: Search, duration: float) -> Any:
-        """Return what is optimized, of motions that last so long [s]: the cost functional."""
+        """Return the cost functional of motions of a duration [s]."""
         return CostFunctional(*self.terms(search, duration))
 
     def optimum(self, problem: Any, supports: Array, stop: Callable[[], bool]) -> Optimum:
-        """Return what supports come to."""
+        """Return the optimum from some supports."""
         p = self.parameters
 
         def accepts(supports: Array, found: Evaluation) -> bool:
@@ -165,10 +165,9 @@ class IncrementalGPMP(IncrementalGPMP2):
 
 
 def spline_of(problem: Factors, supports: Array, start: Start) -> TimedSpline:
-    """Return the cubic B-spline in time near a motion, from what the robot does to rest where the motion ends.
+    """Return the cubic B-spline in time near a motion, from a given state to rest at its end.
 
-    A control point is about where the robot is a knot spacing before its own number of spacings: they are states of the
-    motion. The end, and a start at rest, take a knot spacing longer.
+    Its control points are states of the motion. The end, and a start at rest, take a knot spacing longer.
     """
     count = max(round(problem.process.spacing / KNOT_SPACING), 1)
     states = problem.process.states(supports, count)[:, 0]

@@ -1,4 +1,4 @@
-"""An imitation policy in the closed loop: its next chunks of states, followed unproved, again and again."""
+"""An imitation policy in the closed loop: its next chunks of states, followed unproved."""
 
 from __future__ import annotations
 
@@ -21,23 +21,22 @@ if TYPE_CHECKING:
     from apex_ompl.baselines.imitation.policy import ImitationPolicy
 
 NAME = "policy"
-STILL = 1e-6  # of a way below which the policy stands [rad]
+STILL = 1e-6  # length of a way below which the policy does not move [rad]
 
 
 @dataclass(eq=False)
 class ImitationReplanner:
     """The policy of the planner ``il`` as a reflex (Kim, Ohmura and Kuniyoshi, IROS 2021), to the nearest goal.
 
-    The policy is shown the state in which the robot will be, and obstacles where they are seen. Its share of time is
-    what share of the first distance to the goal has been covered. The next ``steps`` states of its clock are the
-    control points of a motion that ends at rest, and that is replaced by the next replan while it is followed. A motion
-    that ends within ``reach`` of the goal goes to the goal. Nothing is proved: what keeps the robot clear of obstacles
-    is what the policy has learned.
+    The inputs of the policy are the state that the robot will have, and the scene with obstacles where they are seen.
+    Its share of time is the covered share of the initial distance to the goal. The next ``steps`` states of its clock
+    are the control points of a motion that ends at rest, which the next replan replaces. A motion that ends within
+    ``reach`` of the goal goes to the goal. Nothing is proved: only the policy avoids obstacles.
 
     Attributes:
         model: Name or folder of the policy.
         steps: Number of states of its clock that a motion follows.
-        reach: Distance from the goal of any joint from which on the motion ends there [rad].
+        reach: Distance from the goal, of the farthest joint, below which the motion ends there [rad].
     """
 
     model: str = "il"
@@ -60,7 +59,7 @@ class ImitationReplanner:
         self.states(context.setup.start, context.setup.start)
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
-        """Return the motion along the next states of the policy, which nothing has proved, or none."""
+        """Return the unproved motion along the next states of the policy, or none."""
         search = Search(context, request, budget)
         if not len(search.goals):
             return Answer(None, NAME, budget)
