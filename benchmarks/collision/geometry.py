@@ -9,7 +9,7 @@
 2. Scenes of one large mesh that is not convex, up to 40 000 triangles, of the benchmark's own making: arches, rings and
    bumpy balls; starts and goals are the validation problems', free in the scene, and the straight line is not.
 3. Proofs of states by the kernel against the number of triangles and points; set-up, and memory.
-4. New clouds in a world that is kept: points of a wall with bumps as a camera sees it, each in place of the one before,
+4. New clouds in a world that is kept: points of a wavy wall as a camera sees it, each in place of the one before,
    with the first query among them, whether the home state is free.
 
 Usage: python -m benchmarks.collision.geometry [-n 60] [--states 2000]

@@ -2,7 +2,8 @@
 
 ``random weights``: a network like the model's, not trained. ``shuffled conditions``: the model, which sees a training
 problem drawn at random and not the one at hand. ``nearest paths``: training paths of the most similar conditions, moved
-to the ends at hand. Random bumps in the place of proposals are apex's own, by its parameter ``model`` of "none".
+to the ends at hand. Random perturbations in the place of proposals are apex's own, by its parameter ``model`` of
+"none".
 """
 
 from __future__ import annotations

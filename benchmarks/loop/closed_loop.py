@@ -64,7 +64,7 @@ SCRIPTED = "moving"  # kind of the worlds whose obstacles go their way whatever 
 
 
 class Job(NamedTuple):
-    """A run: name of the world, way of replanning, share of the velocity limits, and clock."""
+    """A run: name of the world, replanner, share of the velocity limits, and clock."""
 
     world: str
     method: str

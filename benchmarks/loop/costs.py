@@ -2,7 +2,7 @@
 
 Each kind of work is timed in worlds of the validation split: the median over the worlds of the least of five calls.
 That is too little for what replans take, where nothing is in the caches and there is work of no kind besides. So runs
-on the simulated clock are timed as well, of each way of replanning in turn: what their replans took in sum, by what
+on the simulated clock are timed as well, of each replanner in turn: what their replans took in sum, by what
 they were charged, is a factor on the kinds of work that no way before used. With --write the table becomes that of the
 package, under the next version number.
 
@@ -287,7 +287,7 @@ def network() -> dict[str, float]:
 
 
 def in_replans(alone: Mapping[str, float], names: Sequence[str]) -> tuple[dict[str, float], dict[str, dict[str, Any]]]:
-    """Return what kinds of work cost in replans [s], of what they cost alone, and factors by way of replanning."""
+    """Return what kinds of work cost in replans [s], of what they cost alone, and factors by replanner."""
     costs, known, about = dict(alone), set[str](), {}
     package = json.loads(TABLE.read_text())["seconds"]
     for planner in PLANNERS:

@@ -1,11 +1,11 @@
 """What proposals are worth: B = 1, 8 and 32 of them checked, repaired, checked again and shortened, on test problems.
 
-The models, unguided and guided, stand beside the straight line, random bumps, the nearest training paths, a regression
-network of the same size, conditions and training, the same network with random weights, and with the conditions of
-another problem of the level. All are repaired by the same steps of the same optimizer, shortened, and pass the same
-full check; beside them rrtconnect+polish, whose trees have the tuned range. Times leave out the setup of the problem.
-Each run is stored in benchmarks/runs/proposals when it ends; the command resumes where it was stopped. Runs with other
-models or data need another folder.
+The models, unguided and guided, stand beside the straight line, random perturbations, the nearest training paths, a
+regression network of the same size, conditions and training, the same network with random weights, and with the
+conditions of another problem of the level. All are repaired by the same steps of the same optimizer, shortened, and
+pass the same full check; beside them rrtconnect+polish, whose trees have the tuned range. Times leave out the setup of
+the problem. Each run is stored in benchmarks/runs/proposals when it ends; the command resumes where it was stopped.
+Runs with other models or data need another folder.
 
 The regression network is trained by ``python scripts/train.py scripts/configs/apex.yaml --set
 denoiser.kind=regression --out benchmarks/runs/regression``, with the same --set as the model.
@@ -61,7 +61,7 @@ PAPER = Sampling("ddpm", 256)
 GUIDED_PAPER = Sampling("ddpm", 256, guidance=EQUATION_7)
 METHODS: dict[str, tuple[int, ...]] = {
     "line": (1,),
-    "bumps": (8, 32),
+    "perturbations": (8, 32),
     "nearest paths": COUNTS,
     "regression": (1,),
     "random weights": COUNTS,
@@ -104,7 +104,7 @@ def made_of(method: str, args: argparse.Namespace) -> str:
     Raises:
         SystemExit: The regression network was not trained as the model was.
     """
-    if method in ("line", "bumps", "rrtconnect+polish"):
+    if method in ("line", "perturbations", "rrtconnect+polish"):
         return ""
     if method == "nearest paths":
         return digest(*map(Path, args.data.split(",")))
@@ -180,7 +180,7 @@ def proposer(ready: PlanningSetup, optimizer: Optimizer, job: Job) -> Callable[[
     """Return the function that makes proposals; what does not depend on the problem is loaded before."""
     method, seed = job.planner, job.seed
     kernel, start, goal = ready.checker.kernel, ready.start, ready.goals[0]
-    if method in ("line", "bumps"):
+    if method in ("line", "perturbations"):
         return lambda count: optimizer.starts(start, goal, count, np.random.default_rng(seed))
     if method == "nearest paths":
         near = neighbors(job.params["data"])

@@ -38,8 +38,9 @@ STAGES = ("call", "solve", "first path", "propose", "repair", "polish", "verify"
 WORKER = """
 import json, sys, time
 from apex_ompl import MotionPlanner, load_problem
-from apex_ompl.ompl.process import quiet_ompl
-with quiet_ompl(), MotionPlanner() as planner:
+from ompl import util
+util.noOutputHandler()
+with MotionPlanner() as planner:
     planner.plan_problem(load_problem("wall/easy/800000"))
     print("ready", flush=True)
     for line in sys.stdin:

@@ -1,11 +1,11 @@
 """Planners head to head on all static levels of the test split, through ``apex_ompl.evaluation``.
 
 Rows: apex; apex without trees after its proposals; the straight line and its repair, which ends by itself; rounds of
-eight random bumps instead of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect as OMPL has it and
-tuned; and the baselines of the paper, with their defaults, which are tuned: drrt, gpmp, gpmp2, damon, and the policies
-il and il-paper, which are rolled out once. On the hard and large levels alone: apex with guidance; and, on 20 problems
-of each, the paper's algorithm alone (``apex-paper``), and tuned, 5 s, rrt, lbkpiece1 and planners that use their whole
-time limit.
+eight random perturbations instead of proposals, with the same repair, for 2 s; rrtconnect+polish; rrtconnect as OMPL
+has it and tuned; and the baselines of the paper, with their defaults, which are tuned: drrt, gpmp, gpmp2, damon, and
+the policies il and il-paper, which are rolled out once. On the hard and large levels alone: apex with guidance; and, on
+20 problems of each, the paper's algorithm alone (``apex-paper``), and tuned, 5 s, rrt, lbkpiece1 and planners that use
+their whole time limit.
 Labels of tuned rows name the parameters that benchmarks/planners/tune.py chose; those without any do best with OMPL's
 defaults. apex and rrtconnect+polish have theirs as defaults.
 Each run is stored in benchmarks/runs/head_to_head when it ends, with OMPL's logs and the database for Planner Arena;
@@ -60,7 +60,7 @@ ROWS = (
     Row("apex-paper", "apex", {**PAPER, "guidance": True}, runs=SLOW, levels=HARD),
     Row("straight line + repair", "apex", {**TREELESS, "first": 0, "second": 0, "third": 0, "resample": 0}, 2.0),
     Row(
-        "8 bumps + repair",
+        "8 perturbations + repair",
         "apex",
         {**TREELESS, "model": "none", "line": False, "first": 8, "second": 0, "third": 0, "resample": 0},
         2.0,

@@ -1,4 +1,4 @@
-"""How long it takes from nothing to a plan: the installation, the first plan behind it, later ones, other starts.
+"""How long it takes from nothing to a plan: the installation, the first plan after it, later ones, other starts.
 
 Every row is a process of its own, timed from outside; those of a first plan have an empty home. ``--install`` makes a
 new environment as README's first command does, in parts: environment, downloads, files, byte code, first plan.

@@ -2,13 +2,13 @@
 
 The problems (Chamzas et al. 2022) are those that VAMP's source package ships, ``resources/baxter/problems.tar.bz2``
 unpacked: ``pip download --no-binary :all: --no-deps vamp-planner``. Baxter's fingers are as far open as the problems
-say. No model ships for Baxter: random bumps take the place of apex's proposals. VAMP (Thomason, Kingston and Kavraki
-2024) checks spheres and capsules of its own in single precision, and has no time limit but a number of iterations;
-RoboPlan checks the meshes. Whatever they find is looked at by the full check here, with the real meshes and the limits,
-and repaired where it fails, as rrtconnect's paths are: ``own`` is the share that a planner solves by its own check,
-``failed at first`` counts paths that failed the full one. The last line says how often VAMP's check and this one agree
-on random states near starts and goals. Each run is stored in benchmarks/runs/motion_bench_maker when it ends; the
-command resumes where it was stopped.
+say. No model ships for Baxter: random perturbations take the place of apex's proposals. VAMP (Thomason, Kingston and
+Kavraki 2024) checks spheres and capsules of its own in single precision, and has no time limit but a number of
+iterations; RoboPlan checks the meshes. Whatever they find is looked at by the full check here, with the real meshes and
+the limits, and repaired where it fails, as rrtconnect's paths are: ``own`` is the share that a planner solves by its
+own check, ``failed at first`` counts paths that failed the full one. The last line says how often VAMP's check and this
+one agree on random states near starts and goals. Each run is stored in benchmarks/runs/motion_bench_maker when it ends;
+the command resumes where it was stopped.
 
 Usage: python -m benchmarks.planners.motion_bench_maker FOLDER [-n 30] [--jobs 1]    (needs the extra "peers")
 """

@@ -2,7 +2,7 @@
 
 Each planner plans under limits of 0.05, 0.5 and 5 s, by ``plan`` with a timed motion and as a row of a benchmark, on
 validation problems of three kinds: hard levels; the same with three of their boxes dented, as non-convex meshes; and
-one without a way to the goal. The overrun of a plan is what it takes behind its set-up beyond the limit, clearance and
+one without a way to the goal. The overrun of a plan is the time after its set-up that exceeds the limit, clearance and
 all; that of a row is its end beyond the limit, with OMPL's own measuring left out. An overrun of 0.1 s and 2 % of the
 limit is allowed.
 

@@ -1,10 +1,10 @@
 """How much repair proposals need on scenes of kinds that no training data are of: steps of the optimizer, no times.
 
 Four proposals of each model are checked as they are, and then repaired, the most promising one first, as the planner
-does, for at most 192 steps in all. Beside the checkpoint that ships stand the planner's random bumps, the same network
-with random weights, and checkpoints by their folders, each under its digest. Problems that the straight line's repair
-solves are told apart. Planners and trainings are tuned on the first 16 problems of a level; --first 0 -n 16 takes
-these.
+does, for at most 192 steps in all. Beside the checkpoint that ships stand the planner's random perturbations, the same
+network with random weights, and checkpoints by their folders, each under its digest. Problems that the straight line's
+repair solves are told apart. Planners and trainings are tuned on the first 16 problems of a level; --first 0 -n 16
+takes these.
 Each run is stored in benchmarks/runs/repair_steps when it ends; the command resumes where it was stopped.
 
 Usage: python -m benchmarks.planners.repair_steps [FOLDER ...] [-n 34] [--first 16] [--jobs 2] [--report]
@@ -47,7 +47,7 @@ FOLDER = record.RESULTS.parent / "runs" / "repair_steps"
 COUNT = 4  # proposals, as the planner's first batch has
 MOST = 48 * COUNT  # steps of repair, all that a candidate may have
 WITHIN = (8, 16, 64, MOST)
-LINE, BUMPS, RANDOM = "straight line", "bumps", "random weights"
+LINE, PERTURBED, RANDOM = "straight line", "perturbations", "random weights"
 
 
 @cache
@@ -68,7 +68,7 @@ def rows(folders: Sequence[Path]) -> list[Row]:
         ApexError: A checkpoint cannot be read.
     """
     apex = checkpoint_digest(SHIPPED / "apex")
-    found = [row(LINE, LINE), row("apex", "apex", apex), row(RANDOM, RANDOM, apex), row(BUMPS, NONE)]
+    found = [row(LINE, LINE), row("apex", "apex", apex), row(RANDOM, RANDOM, apex), row(PERTURBED, NONE)]
     for folder in folders:
         read_config(folder)
         digest = checkpoint_digest(folder)

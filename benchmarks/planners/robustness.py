@@ -86,7 +86,7 @@ def many(count: int) -> tuple[str, bool]:
 
 
 def overruns() -> tuple[str, bool]:
-    """How long solve goes on behind the end of its time, at all moments of its work, on problems of all suites."""
+    """How long solve goes on after its time limit, at all moments of its work, on problems of all suites."""
     late = []
     for suite in ("shelf", "cage", "clutter", "swap", "posts", "wall", "bins"):
         for name in problems.frozen_names(suite, "hard", "validation")[:6]:

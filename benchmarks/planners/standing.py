@@ -1,6 +1,7 @@
 """Where apex stands on the hard, large and extreme levels of the test split, and what its network and its trees add.
 
-Rows: apex; the same planner with random bumps in place of the network's proposals, and with no proposals at all; apex
+Rows: apex; the same planner with random perturbations in place of the network's proposals, and with no proposals at
+    all; apex
 without trees; rrtconnect+polish and rrtconnect with the tuned range. Runs are stored with those of head_to_head.py, in
 benchmarks/runs/head_to_head, and those that are there are not made again; the command resumes where it was stopped.
 
@@ -29,7 +30,7 @@ NO_PROPOSALS = {"first": 0, "second": 0, "third": 0, "resample": 0}
 TREES = ("rrtconnect+polish", Row.of("rrtconnect", TUNED["rrtconnect"]).label)
 ROWS = (
     *(row for row in head_to_head.ROWS if row.label in ("apex", "apex without trees")),
-    Row("apex, bumps for proposals", "apex", {"model": "none"}),
+    Row("apex, perturbations for proposals", "apex", {"model": "none"}),
     Row("apex without proposals", "apex", NO_PROPOSALS),
     *(row for row in head_to_head.ROWS if row.label in TREES),
 )

@@ -1,10 +1,11 @@
 """Apex and its controls on the frozen problems of ``unseen``: scenes of kinds that no training data are of.
 
-Rows: apex; the same planner with random bumps, a network of random weights, another problem's conditions, or the
-nearest training paths in the place of proposals; apex, random bumps and random weights without trees, to see what
-proposals are worth where nothing else searches; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the straight
-line and its repair, which ends by itself. With --model, apex with another checkpoint stands beside the one that ships,
-under the checkpoint's digest; controls of a network are those of the one that ships.
+Rows: apex; the same planner with random perturbations, a network of random weights, another problem's conditions, or
+    the
+nearest training paths in the place of proposals; apex, random perturbations and random weights without trees, to see
+what proposals are worth where nothing else searches; rrtconnect+polish; rrtconnect as OMPL has it and tuned; the
+straight line and its repair, which ends by itself. With --model, apex with another checkpoint stands beside the one
+that ships, under the checkpoint's digest; controls of a network are those of the one that ships.
 Planners are tuned on the first 16 problems of a level, which are left out by default.
 Each run is stored in benchmarks/runs/unseen when it ends; the command resumes where it was stopped.
 
@@ -39,9 +40,9 @@ TIMEOUT = 10.0  # [s]
 FROZEN = 50  # problems of a level
 TUNED_ON = 16  # the first of these
 SUITE = "unseen"
-CONTROLS = ("bumps", "random weights", "shuffled conditions", "nearest paths")
+CONTROLS = ("perturbations", "random weights", "shuffled conditions", "nearest paths")
 WITHOUT = " without trees"
-ALONE = tuple(name + WITHOUT for name in ("apex", "bumps", "random weights"))
+ALONE = tuple(name + WITHOUT for name in ("apex", "perturbations", "random weights"))
 TREES = ("rrtconnect+polish", "rrtconnect", Row.of("rrtconnect", TUNED["rrtconnect"]).label, "straight line + repair")
 NAMES = ("apex", *CONTROLS, *ALONE, *TREES)
 
@@ -53,7 +54,9 @@ def rows(names: Sequence[str], model: Path | None) -> list[Row]:
         ApexError: The checkpoint cannot be read.
     """
     known = {row.label: row for row in ROWS if row.label in TREES}
-    known |= {name: Row(name, name) for name in CONTROLS} | {"bumps": Row("bumps", "apex", {"model": "none"})}
+    known |= {name: Row(name, name) for name in CONTROLS} | {
+        "perturbations": Row("perturbations", "apex", {"model": "none"})
+    }
     known["apex"] = Row("apex", "apex")
     for name in ALONE:
         whole = known[name.removesuffix(WITHOUT)]

@@ -1,6 +1,6 @@
-"""Rows of the paper's figures: planners in scenes that stand still, ways of replanning among cubes that move.
+"""Rows of the paper's figures: planners in scenes that stand still, replanners among cubes that move.
 
-A row whose planner, or way of replanning, is not in this installation is left out with a printed line.
+A row whose planner, or replanner, is not in this installation is left out with a printed line.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ SWEPT = tuple(level for level, size in MOVING.items() if size == "large")  # lev
 
 
 def in_loop(label: str, method: str, levels: tuple[str, ...] = (), **changed: float | str) -> Row:
-    """Return the row of a way of replanning, with parameters of the loop that differ from the defaults."""
+    """Return the row of a replanner, with parameters of the loop that differ from the defaults."""
     return Row(label, method, {"speed": PACE, **changed}, levels=levels, runner=RUNNER)
 
 
@@ -77,7 +77,7 @@ METHODS = (
     in_loop("stop-and-wait", "stop-and-wait"),
     in_loop("blind", "blind"),
 )
-"""Ways of replanning on all moving levels; ``ideal`` answers take no time."""
+"""Replanners on all moving levels; ``ideal`` answers take no time."""
 
 SWEEPS = (
     *(in_loop(f"{FAITHFUL}, trigger {d:g} m", "apex-paper", SWEPT, trigger=d) for d in (0.02, 0.1)),

@@ -1,4 +1,4 @@
-"""GPMP and GPMP2 as planners, as a way of replanning, and the clearance costs that they count."""
+"""GPMP and GPMP2 as planners, as a replanner, and the clearance costs that they count."""
 
 from __future__ import annotations
 

@@ -123,7 +123,9 @@ def test_a_stopped_command_goes_on(results: Results, tmp_path: Path, how: signal
     folder, file = tmp_path / "stopped", tmp_path / "stopped" / "runs.jsonl"
     command = [sys.executable, "-m", "apex_ompl.cli", "bench", LEVEL, "--planners", ROWS[1], "--runs", str(RUNS)]
     command += ["--timeout", "10", "--split", "validation", "-o", str(folder)]
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell starts behind it ignores Ctrl-C
+    before = signal.signal(
+        signal.SIGINT, signal.default_int_handler
+    )  # what a shell starts in the background ignores Ctrl-C
     try:
         process = subprocess.Popen(
             command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, start_new_session=True

@@ -1,4 +1,4 @@
-"""Ways of replanning that fail, for processes of their own: straight lines at first, then something else."""
+"""Replanners that fail, for processes of their own: straight lines at first, then something else."""
 
 from __future__ import annotations
 

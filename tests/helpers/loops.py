@@ -1,4 +1,4 @@
-"""Runs of the loop with ways of replanning made by hand, among boxes that cross the straight line."""
+"""Runs of the loop with replanners made by hand, among boxes that cross the straight line."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FAR = Obstacle(name="far", box=(0.1, 0.1, 0.1), position=(2.0, 2.0, 1.0), veloci
 
 
 class ByHand:
-    """A way of replanning that answers what a function says."""
+    """A replanner that answers what a function says."""
 
     def __init__(self, find: Find, seconds: float = 0.03) -> None:
         self.find, self.seconds, self.asked = find, seconds, []

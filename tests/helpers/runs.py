@@ -38,7 +38,7 @@ def standing(robot: Robot, q: np.ndarray, seconds: float) -> Trajectory:
 def problem_of(
     robot: Robot, motion: Trajectory, *scene: Obstacle, allowed: tuple[tuple[str, str], ...] = ()
 ) -> Problem:
-    """A problem from the begin of a motion to its end."""
+    """A problem from the start of a motion to its end."""
     start, goal = (dict(zip(robot.joint_names, q.tolist(), strict=True)) for q in motion.positions[[0, -1]])
     goals = Goal(joints=(goal,))
     return Problem(name="by-hand", robot=robot.name, scene=scene, start=start, goal=goals, allowed=allowed)

@@ -84,7 +84,7 @@ def test_an_answer_under_way_survives_a_late_step_that_changed_nothing() -> None
 
 
 def test_what_is_true_is_told_as_it_is_when_the_step_is_decided_for_a_later_time() -> None:
-    """As on the clock on the wall, where a step is decided in the period before it."""
+    """As on the wall clock, where a step is decided in the period before it."""
     replanner = ByHand(line)
     loop = loop_of(replanner, prediction="truth", guarded=False)
     loop.advance(0.0)

@@ -1,4 +1,4 @@
-"""The executor: the guarantee whatever a way of replanning says, and what happens to answers that are of no use."""
+"""The executor: the guarantee whatever a replanner says, and what happens to answers that are of no use."""
 
 from __future__ import annotations
 

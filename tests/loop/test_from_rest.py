@@ -1,4 +1,4 @@
-"""Ways of replanning that stop first: what they follow, where they stop, and when they ask."""
+"""Replanners that stop first: what they follow, where they stop, and when they ask."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The clock on the wall: the planner in a process of its own, which fails in every way, and steps that come late."""
+"""The wall clock: the planner in a process of its own, which fails in every way, and steps that come late."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def check(found: Trajectory, expected, begin: float, end: float) -> None:
 @settings(max_examples=40)
 @given(shares, shares)
 def test_pieces_are_the_motion(first: float, second: float) -> None:
-    low, high = BEGIN - 0.3, BEGIN + 1.4 * motion().duration  # also before the begin and behind the end
+    low, high = BEGIN - 0.3, BEGIN + 1.4 * motion().duration  # also before the start and after the end
     begin, end = sorted((low + first * (high - low), low + second * (high - low)))
     if end - begin > 1e-6:
         check(one().piece(begin, end), lambda t: values(one(), t), begin, end)

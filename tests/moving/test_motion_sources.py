@@ -25,7 +25,7 @@ def context() -> RunContext:
 
 
 def search_of(context: RunContext, *, slower: float = 1.5, conflict: float = np.inf) -> Search:
-    """A replan 0.3 s behind the begin of the straight motion to the goal, made slower."""
+    """A replan 0.3 s after the start of the straight motion to the goal, made slower."""
     motion = line_from(context, Start.at_rest(context.setup.start), context.goals[0]).slower(slower)
     one, dynamic = Following(motion, 0.0, to_goal=True), DynamicObstacles([FAR])
     request = Request(1, 0.25, 0.3, one, one, dynamic, 0.0, (FAR,), conflict, 0)
@@ -61,7 +61,7 @@ def test_a_path_along_which_nothing_strays_is_the_direct_motion(context: RunCont
 
 
 def test_splines_from_a_moving_start_need_little_more_time_than_the_direct_motion(context: RunContext) -> None:
-    """With states at even times as control points one knot spacing apart from the begin on; 4 times it otherwise."""
+    """With states at even times as control points one knot spacing apart, from the start; 4 times it otherwise."""
     search, goal = search_of(context), context.goals[0]
     direct = search.direct(goal)
     assert direct is not None

@@ -144,7 +144,7 @@ def test_a_planner_that_ignores_its_time(shorten: bool, ready: PlanningSetup) ->
 
 @pytest.mark.parametrize(("timeout", "looks"), [(0.01, 1), (0.1, 1), (0.45, 4), (0.9, 9), (9.5, 95)])
 def test_ompls_benchmark_is_asked_to_end_before_the_reserve(timeout: float, looks: int) -> None:
-    """It looks at the clock every 0.1 s, a little late: the first look behind the time asked for is the last."""
+    """It looks at the clock every 0.1 s, a little late: the first look after the time asked for is the last."""
     asked = runs.request_time(timeout)
     assert 0.1 * (looks - 1) < asked < 0.1 * looks <= max(timeout, 0.1) + 1e-9
 
