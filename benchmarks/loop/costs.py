@@ -32,7 +32,7 @@ from apex_ompl.baselines.damon.replanner import DamonReplanner
 from apex_ompl.baselines.drrt.dynamic_rrt import GoalTree
 from apex_ompl.baselines.drrt.replanner import Clearances, DynamicRRTReplanner
 from apex_ompl.baselines.gpmp.replanner import WORK, IncrementalGPMP2
-from apex_ompl.baselines.imitation.replanner import Imitation
+from apex_ompl.baselines.imitation.replanner import ImitationReplanner
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.loop.replan.one_plan import OneProposal, RRTConnectFromRest
@@ -269,7 +269,7 @@ def network() -> dict[str, float]:
     source.prepare(context)
     model, checker = source.model_and_checker
     query = make_query(checker, setup.start, context.goals[0], point=model.sees_point)
-    policy = Imitation()
+    policy = ImitationReplanner()
     policy.prepare(context)
     begin, end = setup.start, context.goals[0]
     chunk = seconds(lambda: policy.states(begin, end)) / (policy.steps / 8)

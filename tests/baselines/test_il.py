@@ -21,7 +21,7 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.baselines.imitation import policy as policies
 from apex_ompl.baselines.imitation.checkpoint import save_policy
 from apex_ompl.baselines.imitation.policy import shared_policy
-from apex_ompl.baselines.imitation.replanner import Imitation
+from apex_ompl.baselines.imitation.replanner import ImitationReplanner
 from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
@@ -223,7 +223,7 @@ def test_what_is_missing_or_wrong_is_named(straight: Path, problem: Problem, mon
 
 
 def looped(model: Path, *obstacles: Obstacle, **settings: Any) -> tuple[RunRecord, RefereeReport]:
-    method = Imitation(str(model), steps=32)
+    method = ImitationReplanner(str(model), steps=32)
     method.prepare(context_of(PROBLEM, **settings))
     return go(method, *obstacles, **settings)
 
@@ -254,7 +254,7 @@ def test_the_loop_follows_the_policy_unproved_into_what_it_does_not_avoid(
 
 def test_a_replan_begins_as_the_robot_moves_and_is_charged_by_chunks(straight: Path) -> None:
     context = context_of(PROBLEM, **named("il").settings)
-    method = Imitation(str(straight), steps=16)
+    method = ImitationReplanner(str(straight), steps=16)
     method.prepare(context)
     begin, moving = 0.0, Following.resting(context.setup.start, 0.0, context.names)
     for number in range(1, 5):

@@ -37,7 +37,7 @@ class Idle:
 
 
 def test_the_loop_loads_no_problems_baselines_or_evaluation() -> None:
-    done = subprocess.run([sys.executable, "-c", UNUSED], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", UNUSED], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 

@@ -98,7 +98,7 @@ def test_random_crossings(kernel: Kernel, robot: Robot, speed: float, seed: int)
         if dynamic is None or not prove_motion(kernel, dynamic, motion, time, motion.duration + HOLD):
             continue
         edges = np.linspace(time, motion.duration, PIECES + 1)
-        within = {"begin": time, "end": time + HORIZON + HOLD}
+        within = {"start": time, "end": time + HORIZON + HOLD}
         ends = (np.full((1, 2), t) for t in (time, motion.duration))
         start, end = (blocked(kernel, dynamic, motion, place, **within) for place in ends)
         pieces = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), **within)

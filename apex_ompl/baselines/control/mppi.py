@@ -22,10 +22,10 @@ class PathIntegral:
     """Model predictive path integral control (Williams et al. 2017) in joint space, as STORM has it (Bhardwaj et al.).
 
     Rollouts are noise around the controls of the last replan, shifted to the time of joining; besides, there are a stop
-    and straight rollouts to the nearest goal at several speeds. The cost of a rollout is the distance of its states from
-    the nearest goal, and their violation of the clearance margins: to dynamic obstacles at the time of the state, to
-    static obstacles and to the robot itself. The mean, weighted by the softmax of the costs, is followed by a stop and
-    proved; where the whole horizon is not proved, a shorter part of it is tried.
+    and straight rollouts to the nearest goal at several speeds. The cost of a rollout is the distance of its states
+    from the nearest goal, and their violation of the clearance margins: to dynamic obstacles at the time of the state,
+    to static obstacles and to the robot itself. The mean, weighted by the softmax of the costs, is followed by a stop
+    and proved; where the whole horizon is not proved, a shorter part of it is tried.
 
     512 rollouts of 20 steps take about 28 ms by the compute-cost table, since static obstacles and the robot itself are
     checked at every fourth state only. Three sets of parameters were tried in 4 to 8 worlds of each of the kinds

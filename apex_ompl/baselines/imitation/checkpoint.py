@@ -141,7 +141,7 @@ def policy_card(config: NetworkConfig, robot: str, trained: Mapping[str, Any], w
             f"{trained['line']} (mean square error in standard deviations of the data, without noise).",
         ]
     if trained.get("config", {}).get("init"):
-        lines[-1:] = [f"{lines[-1]} It started with the weights of `{trained['config']['init']}`."]
+        lines[-1:] = [f"{lines[-1]} It began with the weights of `{trained['config']['init']}`."]
     lines += [
         "",
         "What it rolls out is not valid until it is checked. The planners `il` and `il-paper` use such policies; "
