@@ -16,9 +16,8 @@ from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import array_to_path, await_goal, path_to_array
 from apex_ompl.ompl.tuned import TUNED
-from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.paths.path import Path
-from apex_ompl.paths.settings import OptimizerSettings
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 

@@ -17,9 +17,8 @@ from functools import cache, partial
 
 import numpy as np
 
-from apex_ompl.goals.alignment_sampling import AlignmentSampler
-from apex_ompl.goals.cover_clearance import scene_kernel
 from apex_ompl.goals.grasp import HandObjects
+from apex_ompl.goals.state_sampling import AlignmentSampler, scene_kernel
 from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem
 from apex_ompl.problems.objects import block_and_peg, boxes, cup_and_ball
 from apex_ompl.problems.suite_robot import robot

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from apex_ompl.errors import ApexError
-from apex_ompl.goals.hand_poses import HandPoseSampler
+from apex_ompl.goals.state_sampling import HandPoseSampler
 from apex_ompl.problems import alignment, scenes
 from apex_ompl.problems.broad import drawing, simple
 from apex_ompl.problems.broad.levels import GRAMMARS, SUITE

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from apex_ompl.goals.hand_poses import Direction, HandRegion
+from apex_ompl.goals.state_sampling import Direction, HandRegion
 from apex_ompl.problems.obstacles import bar, box, primitive
 from apex_ompl.scene.bodies import Obstacle
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from apex_ompl.goals.hand_poses import DualArmTables
+from apex_ompl.goals.state_sampling import DualArmTables
 from apex_ompl.robot import Robot, load_robot
 
 ROBOT = "dual_panda_softhand"

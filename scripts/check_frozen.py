@@ -44,7 +44,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument(
-        "--redraw", type=whole_number, default=0, metavar="N", help="draw N of each level anew, and compare"
+        "--redraw", type=whole_number, default=0, metavar="N", help="draw N of each level again, and compare"
     )
     args = parser.parse_args()
     every = [f"{suite}/{level}" for suite, level in frozen.suite_levels()]

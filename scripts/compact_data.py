@@ -19,7 +19,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.util.validation import whole_number
 
-CLOSE = 200  # the limit on the size is met to one part in this
+CLOSE = 200  # the size is within one part in this of its limit
 
 
 def some(paths: Paths, count: int, seed: int) -> Paths:
@@ -74,7 +74,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("file", type=Path, metavar="FILE.zip")
     parser.add_argument("--mib", type=mebibytes, default=24.0, help="largest size (default: %(default)s)")
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choice (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="seed of the random choice (default: %(default)s)")
     args = parser.parse_args()
     compact(args)
 

@@ -41,7 +41,7 @@ def root_part(robot: Robot, config: RobotConfig, link: str) -> str:
 
 
 def candidates(robot: Robot, config: RobotConfig) -> list[tuple[int, int]]:
-    """Return the geometry index pairs to look at: enabled ones whose parts stand on one root part."""
+    """Return the geometry index pairs to test: enabled ones whose parts have the same root part."""
     items = robot.geometry.geometryObjects
     chosen = []
     for pair in robot.geometry.collisionPairs:
@@ -142,10 +142,10 @@ def as_yaml(name: str) -> str:
 def main() -> None:
     """Derive and write the pairs of one robot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("robot", help="one that ships, by name, or a robot file")
+    parser.add_argument("robot", help="name of a shipped robot, or a robot file")
     parser.add_argument("--soft", action="append", default=[], metavar="PART")
     parser.add_argument("--samples", type=one_or_more, default=200_000)
-    parser.add_argument("--margin", type=float, default=0.02, help="meters")
+    parser.add_argument("--margin", type=float, default=0.02, help="least distance of a pair [m]")
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()
     robot, config, path = bare_robot(args.robot)

@@ -1,6 +1,6 @@
 """Print and plot the statistics of a data set: a folder that generate_data made, or a file of paths.
 
-Writes description.md, figures.png and motions.jpg (some random ones) into a folder.
+Writes description.md, figures.png and motions.jpg (random motions) into a folder.
 
 Usage: python scripts/describe_data.py DATA [--out FOLDER] [--check 200] [--motions 10] [--seed 0]
 """
@@ -16,7 +16,7 @@ from apex_ompl import problems
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.training import description
+from apex_ompl.training import records
 from apex_ompl.training.records import SOURCES, DatasetError, Paths
 from apex_ompl.training.store import Store, load
 from apex_ompl.util.entry_point import run_script
@@ -26,7 +26,7 @@ from apex_ompl.util.validation import one_or_more, whole_number
 SHOTS, MOTIONS, SIZE = 5, 10, (320, 240)
 
 
-def table(figures: list[description.LevelStatistics]) -> str:
+def table(figures: list[records.LevelStatistics]) -> str:
     """Return the table of the levels in Markdown."""
     head = ["level", "problems", "paths", *SOURCES, "straight", "homotopies", "several", "duplicates"]
     head += ["length rad p5", "p50", "p95", "clearance mm p5", "p50", "p95"]
@@ -39,7 +39,7 @@ def table(figures: list[description.LevelStatistics]) -> str:
 
 
 def checked(paths: Paths, which: np.ndarray) -> str:
-    """Return a sentence on how many of some stored paths pass the full check."""
+    """Return a sentence with the number of given stored paths that pass the full check."""
     control, spline, good = paths.control(which), paths.spline, 0
     for k, points in zip(which, control, strict=True):
         ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
@@ -47,7 +47,7 @@ def checked(paths: Paths, which: np.ndarray) -> str:
     return f"{good} of {len(which)} random paths pass the full check as they are stored."
 
 
-def plot(paths: Paths, figures: list[description.LevelStatistics], file: Path) -> None:
+def plot(paths: Paths, figures: list[records.LevelStatistics], file: Path) -> None:
     """Draw lengths, clearances, sources and the coverage of joints."""
     from io import BytesIO
 
@@ -70,7 +70,7 @@ def plot(paths: Paths, figures: list[description.LevelStatistics], file: Path) -
     axes[1, 0].set_title("paths, by level and source")
     axes[1, 0].tick_params(axis="y", labelsize=7)
     axes[1, 0].legend(fontsize=8)
-    low, middle, high = description.coverage(paths, limits.lower, limits.upper)
+    low, middle, high = records.coverage(paths, limits.lower, limits.upper)
     joints = np.arange(len(low))
     axes[1, 1].bar(joints, high - low, bottom=low, color="#9db8d2", label="1st to 99th percentile")
     axes[1, 1].plot(joints, middle, "k_", markersize=14, label="median")
@@ -108,7 +108,7 @@ def describe(args: argparse.Namespace) -> None:
     paths = load(args.data) if is_file(args.data) else Paths.concatenate(Store(args.data))
     if not len(paths):
         raise DatasetError(f"{args.data}: there are no paths, expected some")
-    figures = description.level_statistics(paths)
+    figures = records.level_statistics(paths)
     rng = np.random.default_rng(args.seed)
     text = [f"# {args.data.name}", "", f"{len(paths)} paths of {paths.problems} problems.", "", table(figures), ""]
     if args.check:
@@ -127,12 +127,14 @@ def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, metavar="DATA")
-    parser.add_argument("--out", type=Path, default=Path(), help="folder (default: this one)")
+    parser.add_argument("--out", type=Path, default=Path(), help="folder of the results (default: the current one)")
     parser.add_argument(
         "--check", type=whole_number, default=200, help="paths that are proved again (default: %(default)s)"
     )
-    parser.add_argument("--motions", type=one_or_more, default=MOTIONS, help="that are drawn (default: %(default)s)")
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choices (default: %(default)s)")
+    parser.add_argument(
+        "--motions", type=one_or_more, default=MOTIONS, help="motions that are drawn (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=whole_number, default=0, help="seed of the choices (default: %(default)s)")
     args = parser.parse_args()
     describe(args)
 

@@ -18,8 +18,7 @@ LARGEST = 24.0  # of all that ship together [MiB]
 def export(run: Path, name: str, bits: Literal[8, 16]) -> None:
     """Read and check the checkpoint of a run, and write it."""
     from apex_ompl.model.checkpoint import SHIPPED
-    from apex_ompl.training.checkpoint_writer import save_model
-    from apex_ompl.training.torch_model import load_torch_model
+    from apex_ompl.training.torch_model import load_torch_model, save_model
 
     folder = run / "checkpoint" if (run / "checkpoint").is_dir() else run
     model = load_torch_model(folder)
@@ -34,8 +33,8 @@ def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a training run, or a checkpoint")
-    parser.add_argument("name", metavar="NAME", help="for example apex")
-    parser.add_argument("--bits", type=int, choices=(8, 16), default=16, help="of a weight (default: %(default)s)")
+    parser.add_argument("name", metavar="NAME", help="name of the checkpoint, for example apex")
+    parser.add_argument("--bits", type=int, choices=(8, 16), default=16, help="bits of a weight (default: %(default)s)")
     args = parser.parse_args()
     export(args.run, args.name, args.bits)
 

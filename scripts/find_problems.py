@@ -2,7 +2,7 @@
 
 Reaching problems give poses of both hands at start and goal; alignment problems give objects in the hands and
 how they are to meet. States are found by inverse kinematics from seeded random states. A problem is kept when its
-start (and goal) is free with 1 cm to spare, no straight line to a goal is free for seed 0, and rrtconnect finds a
+start (and goal) is free with a clearance of 1 cm, no straight line to a goal is free for seed 0, and rrtconnect finds a
 path that passes the full check for three seeds.
 
 Usage: python scripts/find_problems.py [NAME ...]
@@ -78,7 +78,7 @@ def named(robot: Robot, q: np.ndarray) -> dict[str, float]:
 
 
 def is_hard_enough(problem: Problem, robot: Robot) -> bool:
-    """Whether no straight line solves a problem for seed 0, and rrtconnect does for three seeds."""
+    """Whether no straight line solves a problem for seed 0, while rrtconnect solves it for three seeds."""
     ready = assemble(problem, robot, seed=0)
     lines = [np.array([ready.start, goal]) for goal in ready.goals]
     if not lines or any(full_check(ready.checker, line) for line in lines):
@@ -111,7 +111,7 @@ def find_reach(specification: ReachSpecification) -> Problem:
 
 
 def find_alignment(specification: AlignmentSpecification) -> Problem:
-    """Return the problem of an alignment specification: from a random free start with the hands well apart."""
+    """Return the problem of an alignment specification, with a random free start whose hands are far apart."""
     robot = load_robot("dual_panda_softhand")
     scene = tuple(specification.scene())
     attached, home = hold(robot, specification.held())
@@ -148,7 +148,7 @@ def with_relative_meshes(problem: Problem) -> Problem:
 
 
 def main() -> None:
-    """Write the meshes, and find the problems named, or all."""
+    """Write the meshes, and find the named problems, or all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*")
     names = parser.parse_args().names

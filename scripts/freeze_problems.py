@@ -1,10 +1,10 @@
 """Draw the frozen validation and test problems of the suites, find a witness for each, and write their files.
 
-Draws for which no witness is found are dropped and drawn anew. Problems that exist are left alone, since results refer
-to them, and missing ones are added; --replace draws all again.
+Draws for which no witness is found are dropped and drawn anew. Existing problems are kept, since results refer to
+them, and missing ones are added; --replace draws all again.
 --mend finds new witnesses for the problems named, which stay as they are.
 
-Witnesses among obstacles that stand still are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
+Witnesses among static obstacles are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
 with a range of 0.7 rad, each in eight seconds. There they keep half a millimeter of clearance: obstacles are a
 millimeter larger on each side for the planner, and the robot's own distances are looked up along its path.
 On ``unseen`` apex, and else rrtconnect with its tuned range, each have ten seconds.
@@ -180,7 +180,7 @@ def is_complete(level: tuple[str, str]) -> bool:
 
 
 def freeze(level: tuple[str, str], anew: bool) -> tuple[dict[int, FrozenProblem], int, float]:
-    """Return the frozen problems of a suite and level by seed, how many draws had no witness, and the time taken.
+    """Return the frozen problems of a level by seed, the number of draws without a witness, and the time taken.
 
     Those that exist are kept, unless all are to be drawn anew.
     """
@@ -193,7 +193,7 @@ def freeze(level: tuple[str, str], anew: bool) -> tuple[dict[int, FrozenProblem]
 
 
 def freeze_problem(problem_id: ProblemId) -> tuple[FrozenProblem, int]:
-    """Return the first draw of a problem with a witness, and how many draws before it had none."""
+    """Return the first draw of a problem with a witness, and the number of draws before it."""
     number, dropped = -1, 0
     while True:
         number, drawn = first_drawn(problem_id, number)
@@ -230,8 +230,8 @@ def main() -> None:
     """Freeze the levels named, or all that are missing."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("levels", nargs="*", metavar="SUITE/LEVEL")
-    parser.add_argument("--replace", action="store_true", help="draw problems again that exist")
-    parser.add_argument("--mend", action="store_true", help="find new witnesses for the problems named")
+    parser.add_argument("--replace", action="store_true", help="draw existing problems again, too")
+    parser.add_argument("--mend", action="store_true", help="find new witnesses for the named problems")
     parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
     if args.mend:

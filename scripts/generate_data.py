@@ -4,7 +4,7 @@ The same options give the same paths. The same command resumes an interrupted ru
 lost. With one worker everything runs in this process; more are run by Ray, on this machine or on a cluster.
 
 With --write-cases problems are only drawn, and written for machines without Pinocchio, Coal and OMPL; there --cases
-solves them by trees and from random bumps, and keeps the paths that the sphere cover proves free.
+solves them by trees and from random perturbations, and keeps the paths that the sphere cover proves free.
 
 Usage: python scripts/generate_data.py FOLDER [--problems 10000] [--workers 2] [--address HOST:PORT] [SUITE[/LEVEL] ...]
 """
@@ -129,8 +129,7 @@ def _planned_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dic
     """Return the solving function, units to draw, the robot for the manifest, and its tables with empty hands."""
     from apex_ompl.collision import CollisionChecker
     from apex_ompl.problems.suite_robot import robot
-    from apex_ompl.training.problem_solving import solve_unit
-    from apex_ompl.training.units import plan_units
+    from apex_ompl.training.units import plan_units, solve_unit
 
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}
@@ -165,8 +164,7 @@ def write_cases(args: argparse.Namespace) -> None:
     Raises:
         MissingFileError: The folder cannot be made.
     """
-    from apex_ompl.training.problem_records import kernel_problems
-    from apex_ompl.training.units import plan_units
+    from apex_ompl.training.units import kernel_problems, plan_units
 
     check_writable(make_folder(args.folder, "folder for problems") / "cases.npz")
     units = plan_units(args.problems, args.levels, args.split)
@@ -189,35 +187,35 @@ def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", metavar="FOLDER")
-    parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]", help="by default all static ones, and broad")
+    parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]", help="by default all static levels, and broad")
     parser.add_argument(
-        "--problems", type=one_or_more, default=10_000, help="how many to draw, about (default: %(default)s)"
+        "--problems", type=one_or_more, default=10_000, help="about how many to draw (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=whole_number, default=0, help="of the random choices (default: %(default)s)")
+    parser.add_argument("--seed", type=whole_number, default=0, help="seed of the choices (default: %(default)s)")
     parser.add_argument(
-        "--copies", type=one_or_more, default=EngineOptions.copies, help="paths sought (default: %(default)s)"
+        "--copies", type=one_or_more, default=EngineOptions.copies, help="searches a problem (default: %(default)s)"
     )
     parser.add_argument(
         "--parts", type=whole_number, default=EngineOptions.parts, help="parts of each path (default: %(default)s)"
     )
-    parser.add_argument("--model", default="", help="whose proposals are tried first, for example apex (default: none)")
+    parser.add_argument("--model", default="", help="its proposals are tried first, for example apex (default: none)")
     parser.add_argument("--control-points", type=one_or_more, default=Spline.points, help="(default: %(default)s)")
     parser.add_argument("--pinned", type=one_or_more, default=Spline.pinned, help="at each end (default: %(default)s)")
     parser.add_argument(
-        "--workers", type=one_or_more, default=1, help="more than one are run by Ray (default: %(default)s)"
+        "--workers", type=one_or_more, default=1, help="processes, by Ray if several (default: %(default)s)"
     )
-    parser.add_argument("--address", help="of a Ray cluster, for example 10.0.0.1:6379, or auto")
+    parser.add_argument("--address", help="address of a Ray cluster, for example 10.0.0.1:6379, or auto")
     parser.add_argument("--write-cases", action="store_true", help="draw problems only, and write them to FOLDER")
     parser.add_argument(
-        "--split", choices=("train", "validation"), default="train", help="of --write-cases (default: %(default)s)"
+        "--split", choices=("train", "validation"), default="train", help="for --write-cases (default: %(default)s)"
     )
     parser.add_argument("--cases", metavar="FOLDER", help="solve the problems that --write-cases wrote there")
     parser.add_argument("--quiet", action="store_true", help="show no progress")
-    args = parser.parse_intermixed_args()  # suites may stand behind options
+    args = parser.parse_intermixed_args()  # suites may come after options
     if args.model and (args.cases or args.write_cases):
-        parser.error("--model goes with problems that are drawn here")
+        parser.error("--model needs problems that are drawn here: leave out --cases and --write-cases")
     if args.split != "train" and not args.write_cases:
-        parser.error("--split validation goes with --write-cases: data are of the training split")
+        parser.error("--split validation needs --write-cases: data sets are of the training split")
     write_cases(args) if args.write_cases else generate(args)
 
 

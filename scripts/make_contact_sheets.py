@@ -1,6 +1,6 @@
-"""Draw a few problems of every suite and level into docs/pictures/suites, a sheet a suite: start, and goal as a ghost.
+"""Draw problems of every suite and level into docs/pictures/suites, one sheet a suite: start, and goal as a ghost.
 
-The sheets of ``broad`` and ``unseen``, a problem a grammar, are drawn where they are named.
+The sheets of ``broad`` and ``unseen``, with one problem for each grammar, are drawn only if they are named.
 
 Usage: python scripts/make_contact_sheets.py [--first 0] [--columns 3] [SUITE ...]
 """
@@ -31,7 +31,7 @@ SOME_MOVING = ("moving-small-0.1", "moving-large-0.2", "moving-huge-0.4")
 
 
 def picture(name: str, azimuth: float) -> Image.Image:
-    """Return the picture of a problem with its name on it."""
+    """Return the picture of a problem with its name."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "problem.png"
         render(problems.load(name), file, DRAWN, azimuth)
@@ -63,7 +63,7 @@ def sheet(suite: str, first: int, columns: int) -> Image.Image:
 
 
 def main() -> None:
-    """Draw the sheets of the suites named, or of all."""
+    """Draw the sheets of the named suites, or of all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("suites", nargs="*")
     parser.add_argument(

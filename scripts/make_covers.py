@@ -47,11 +47,11 @@ def row(name: str, geometry: coal.CollisionGeometry, cover: Cover, seconds: floa
 def main() -> None:
     """Make and write the covers of one robot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("robot", help="one that ships, by name, or a robot file")
-    parser.add_argument("--gaps", type=float, nargs="+", default=list(GAPS), help="meters, descending")
-    parser.add_argument("--tolerances", type=float, nargs="+", help="meters: only compare these gaps")
+    parser.add_argument("robot", help="name of a shipped robot, or a robot file")
+    parser.add_argument("--gaps", type=float, nargs="+", default=list(GAPS), help="gaps of the levels, descending [m]")
+    parser.add_argument("--tolerances", type=float, nargs="+", help="only compare these gaps [m]")
     parser.add_argument("--only", default="", help="only shapes of links whose names contain this, with --tolerances")
-    parser.add_argument("--effort", type=int, default=3, choices=(1, 2, 3), help="how thorough the search is")
+    parser.add_argument("--effort", type=int, default=3, choices=(1, 2, 3), help="thoroughness of the search")
     parser.add_argument("-o", "--output", type=Path)
     args = parser.parse_args()
     robot, config, path = bare_robot(args.robot)

@@ -18,7 +18,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder, write_atomically
 
 PROBLEM_STRIDE, CASE_STRIDE = 60, 4
-EASY_SUITE = "bins"  # most of its problems are solved by repairing the straight line, so they tell models apart badly
+EASY_SUITE = "bins"  # repairing the straight line solves most of its problems, so they hardly distinguish models
 
 
 def make(source: Path, out: Path) -> None:

@@ -1,11 +1,13 @@
 """Reproduce the paper: its figures, each with numbers, a table and a picture, and the page that compares them.
 
 ``failure``: failure ratio R_f and smoothness S_r by task, all planners.
-``size``: failure ratio over the size of cubes that stand still, guided and unguided.
+``size``: failure ratio over the size of static cubes, guided and unguided.
 ``time``: planning time; one run at a time, on a machine that does nothing else.
-``dynamic``: failure ratio by task and over size among moving cubes, and what the choices of the loop change.
-``fid``: FID and KID of all algorithms. ``denoising``, ``diversity``: the model at work, drawn.
-``strips``: runs with and without guidance, drawn. ``failures``: a collision, a robot that is stuck, a wrong alignment.
+``dynamic``: failure ratio by task and over size among moving cubes, and the effect of the choices of the loop.
+``fid``: FID and KID of all algorithms.
+``denoising``, ``diversity``: pictures of the denoising steps, and of several proposals.
+``strips``: pictures of runs with and without guidance.
+``failures``: a collision, a robot that is stuck, a wrong alignment.
 ``page``: docs/paper.md, from the results. ``all``: all of these.
 
 Every run is stored in benchmarks/runs when it ends: stop the command at any moment and give it again. ``failure`` and
@@ -46,7 +48,7 @@ FIGURES = {
     "denoising": ("model_pictures", 1, "problems"),
     "diversity": ("model_pictures", 12, "trajectories"),
 }
-"""Module of each figure, in the order of ``all``, and how much of what is measured by default."""
+"""Module of each figure, in the order of ``all``, with the default number of problems or runs and its unit."""
 ALL, PAGE = "all", "page"
 
 
@@ -55,7 +57,7 @@ def parsed() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", choices=(ALL, *FIGURES, PAGE))
     usual = "; ".join(f"{name}: {n} {what}" for name, (_, n, what) in FIGURES.items())
-    parser.add_argument("-n", type=one_or_more, help=f"how many, of a figure (defaults: {usual})")
+    parser.add_argument("-n", type=one_or_more, help=f"number of problems or runs of a figure (defaults: {usual})")
     parser.add_argument("--jobs", type=one_or_more, default=2, help="runs at a time, except for time (default: 2)")
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")

@@ -24,9 +24,8 @@ def train(args: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from apex_ompl.training.config import TrainingConfig
-    from apex_ompl.training.distributed import DistributedProcess
     from apex_ompl.training.kernel_problems import load_kernel_problems
-    from apex_ompl.training.training import Trainer
+    from apex_ompl.training.training import DistributedProcess, Trainer
 
     config = TrainingConfig.read(args.config, dict(args.set))
     folder = make_folder(args.out or Path("runs") / Path(args.config).stem, "folder of a training run")

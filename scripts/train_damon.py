@@ -1,7 +1,7 @@
 """Make the manifolds of the planner ``damon``: autoencoders of states of the training paths, and their graphs.
 
-Each dimension takes some minutes on one core; folders that are there already are left as they are, so that the command
-goes on where it was stopped.
+Each dimension takes some minutes on one core; existing folders are kept, so that the command resumes where it was
+stopped.
 
 Usage: python scripts/train_damon.py [--dims 2 4 8] [--nodes 20000] [--neighbors 12] [--beta 1e-3] [--again]
 """
@@ -98,16 +98,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     data = ROOT / "data" / "dual_panda_softhand"
     parser.add_argument("--data", type=Path, default=data, help="folder with paths.zip and robot.npz")
-    parser.add_argument("--out", type=Path, default=weights_folder(), help="where to put them (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=weights_folder(), help="their folder (default: %(default)s)")
     parser.add_argument("--dims", type=one_or_more, nargs="+", default=[2, 4, 8], help="(default: %(default)s)")
-    parser.add_argument("--states", type=one_or_more, default=200_000, help="states of paths (default: %(default)s)")
-    parser.add_argument("--along", type=one_or_more, default=16, help="of them on a path (default: %(default)s)")
-    parser.add_argument("--nodes", type=one_or_more, default=20_000, help="nodes (default: %(default)s)")
-    parser.add_argument("--neighbors", type=one_or_more, default=12, help="of a node (default: %(default)s)")
+    parser.add_argument("--states", type=one_or_more, default=200_000, help="number of states (default: %(default)s)")
+    parser.add_argument("--along", type=one_or_more, default=16, help="states of a path (default: %(default)s)")
+    parser.add_argument("--nodes", type=one_or_more, default=20_000, help="number of nodes (default: %(default)s)")
+    parser.add_argument("--neighbors", type=one_or_more, default=12, help="neighbors of a node (default: %(default)s)")
     parser.add_argument("--beta", type=float, default=1e-3, help="weight of the divergence (default: %(default)s)")
-    parser.add_argument("--epochs", type=one_or_more, default=20, help="passes (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of all random choices (default: %(default)s)")
-    parser.add_argument("--again", action="store_true", help="make folders anew that are there")
+    parser.add_argument("--epochs", type=one_or_more, default=20, help="passes over the states (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of all random choices (default: %(default)s)")
+    parser.add_argument("--again", action="store_true", help="replace existing folders")
     args = parser.parse_args()
     args.nodes = min(args.nodes, MOST_NODES)
     for dim in args.dims:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from apex_ompl.apex.bumps import BumpModel
+from apex_ompl.apex.perturbations import PerturbationModel
 from apex_ompl.errors import MissingFileError
 from apex_ompl.model.checkpoint import SHIPPED, read_config, shared_model
 from apex_ompl.model.proposals import TrajectoryModel
@@ -12,7 +12,7 @@ from apex_ompl.model.proposals import TrajectoryModel
 DEFAULT = "apex"  # checkpoint that ships
 AUTO, NONE = "auto", "none"  # names in the place of a checkpoint's
 
-Model = TrajectoryModel | BumpModel
+Model = TrajectoryModel | PerturbationModel
 """What makes proposals."""
 
 
@@ -35,11 +35,11 @@ def _robot_of_default() -> str | None:
 
 
 def trajectory_model(name: str, robot: str, device: str = "cpu") -> Model:
-    """Return a checkpoint's model for a robot, or random bumps.
+    """Return a checkpoint's model for a robot, or random perturbations.
 
     Args:
         name: Name or folder of a checkpoint; ``auto`` takes the one that ships for the robot, or ``none`` where there
-            is none: random bumps of straight lines.
+            is none: random perturbations of straight lines.
         robot: Name of the robot.
         device: Where a network runs.
 
@@ -48,4 +48,4 @@ def trajectory_model(name: str, robot: str, device: str = "cpu") -> Model:
     """
     if name == AUTO:
         name = DEFAULT if has_model(robot) else NONE
-    return BumpModel() if name == NONE else shared_model(name, device=device, robot=robot)
+    return PerturbationModel() if name == NONE else shared_model(name, device=device, robot=robot)

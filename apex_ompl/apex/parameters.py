@@ -30,7 +30,7 @@ class ApexParameters(Parameters):
 
     Attributes:
         model: Name or folder of a checkpoint; ``auto`` takes the one that ships for the robot, or ``none`` where there
-            is none: random bumps of straight lines.
+            is none: random perturbations of straight lines.
         robot: The robot, by name or file, where the validity checker is not this project's; ``auto`` takes that of the
             setup of ``apex_ompl.setup``, or else ``dual_panda_softhand``.
         device: Where the network runs.

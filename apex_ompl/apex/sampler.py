@@ -9,10 +9,10 @@ import numpy as np
 
 from apex_ompl.apex.models import Model
 from apex_ompl.kernel import Kernel
+from apex_ompl.model.diffusion import Estimate
 from apex_ompl.model.geometry import Numbers
 from apex_ompl.model.proposals import Proposals, Sampling
 from apex_ompl.model.query import Query
-from apex_ompl.model.schedule import Estimate
 from apex_ompl.ompl.report import SolveReport
 from apex_ompl.types import Array
 

@@ -23,25 +23,106 @@ Angles are in radians, lengths in meters.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, UnknownNameError
-from apex_ompl.goals.alignment_errors import UP, angle, lowest_direction, within
 from apex_ompl.goals.inverse_kinematics import Links, in_world
-from apex_ompl.goals.link_faces import LinkFace, lip_direction
 from apex_ompl.kernel import Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Alignment, Problem, WorldVector
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import length
 from apex_ompl.util.forking import ProcessLock
 
+UP = np.array([0.0, 0.0, 1.0])
+"""Upward direction of the world."""
 DEFAULT_TILT = (1.75, 2.36)  # 100 to 135 degrees from upright
 RESTART_SPREAD = 0.6  # standard deviation of initial states around home [rad]
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
+
+
+def angle(a: Array, b: Array) -> float:
+    """Return the angle between two vectors, atan2(|a x b|, a . b) [rad], accurate for nearly parallel vectors too."""
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
+
+
+def within(errors: Mapping[str, float], bounds: Mapping[str, float]) -> bool:
+    """Whether every error is at most its bound, up to rounding."""
+    return all(value <= bounds[name] + 1e-12 for name, value in errors.items())
+
+
+def lowest_direction(axis: Array) -> Array:
+    """Return the lowest unit vector orthogonal to a unit axis, shape (3,); down itself for a vertical axis."""
+    down = -UP + (UP @ axis) * axis
+    length = float(np.linalg.norm(down))
+    return down / length if length > 1e-9 else -UP
+
+
+@dataclass(frozen=True)
+class LinkFace:
+    """A contact face fixed to a link.
+
+    Attributes:
+        link: The link.
+        point: Center of the face in the link's frame, shape (3,) [m].
+        axis: Outward unit axis in the link's frame, shape (3,).
+    """
+
+    link: str
+    point: Array
+    axis: Array
+
+    @classmethod
+    def of_object(cls, held: AttachedObject) -> LinkFace:
+        """Return the contact face of a held object."""
+        assert held.contact is not None
+        pose = held.pose
+        axis = pose[:3, :3] @ np.asarray(held.contact.axis, float)
+        point = pose[:3, :3] @ np.asarray(held.contact.point, float) + pose[:3, 3]
+        return cls(held.link, point, axis / length(axis))
+
+    @classmethod
+    def of_vector(cls, robot: Robot, vector: WorldVector, start: Array) -> LinkFace:
+        """Return the face given by a vector in the world, fixed to its link at the state ``start``.
+
+        Raises:
+            UnknownNameError: No such link.
+        """
+        pose = robot.link_pose(start, vector.link)
+        tail, tip = np.asarray(vector.tail, float), np.asarray(vector.tip, float)
+        axis = pose[:3, :3].T @ (tip - tail)
+        return cls(vector.link, pose[:3, :3].T @ (tip - pose[:3, 3]), axis / length(axis))
+
+    @classmethod
+    def of_hand(cls, robot: Robot, name: str) -> LinkFace:
+        """Return the grasp point of a hand with the outward normal of its palm.
+
+        Raises:
+            UnknownNameError: No such hand.
+        """
+        if name not in robot.hands:
+            raise UnknownNameError("hand", name, robot.hands)
+        hand = robot.hands[name]
+        return cls(hand.palm, np.asarray(hand.point, float), np.asarray(hand.axis, float))
+
+
+def lip_direction(vessel: AttachedObject) -> Array | None:
+    """Return the unit direction from the axis of a vessel to its lip, in the link's frame, shape (3,).
+
+    It is the part of the contact point across the contact axis; None where the point lies on the axis.
+    """
+    assert vessel.contact is not None
+    axis = np.asarray(vessel.contact.axis, float)
+    axis = axis / length(axis)
+    point = np.asarray(vessel.contact.point, float)
+    across = vessel.pose[:3, :3] @ (point - float((axis * point).sum()) * axis)
+    size = length(across)
+    return across / size if size > 1e-6 else None
 
 
 class AlignmentGoal:

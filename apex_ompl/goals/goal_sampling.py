@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.goals.alignment_errors import within
+from apex_ompl.goals.alignment import within
 from apex_ompl.types import Array
 
 

@@ -1,4 +1,4 @@
-"""IKSolver kinematics in terms of links: their points and directions as residuals of the kernel's solver."""
+"""Inverse kinematics of links: points and directions fixed to them, as residuals of the kernel's solver."""
 
 from __future__ import annotations
 

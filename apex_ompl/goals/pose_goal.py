@@ -1,4 +1,4 @@
-"""Pose goals: frames of hands, links or held objects that are to reach poses in the world."""
+"""Pose goals: poses in the world for frames of hands, links or held objects."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.errors import UnknownNameError
-from apex_ompl.goals.alignment_errors import angle
+from apex_ompl.goals.alignment import LinkFace, angle
 from apex_ompl.goals.inverse_kinematics import Links, in_world
-from apex_ompl.goals.link_faces import LinkFace
 from apex_ompl.kernel import Target, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
@@ -21,7 +20,7 @@ from apex_ompl.util.forking import ProcessLock
 
 SPREAD = 0.6  # largest standard deviation of initial states around the start [rad]
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
-RESIDUAL = 1e-6  # at which the inverse kinematics ends
+RESIDUAL = 1e-6  # largest residual at which inverse kinematics ends
 
 
 class Frame(NamedTuple):
@@ -39,7 +38,7 @@ class Frame(NamedTuple):
 
 
 class PoseGoal:
-    """Poses that frames of a robot are to reach all at once; joints that move none of them stay as at the start."""
+    """Poses that frames of a robot reach together; joints that move none of the frames stay as at the start."""
 
     def __init__(
         self, robot: Robot, poses: Sequence[PoseTarget], attached: Sequence[AttachedObject], start: Array
@@ -53,11 +52,11 @@ class PoseGoal:
             start: The start, shape (dof,).
 
         Raises:
-            UnknownNameError: A frame is no hand, link or held object.
+            UnknownNameError: A frame is not a hand, a link or a held object.
         """
         self.robot = robot
         self.poses = tuple(poses)
-        self.start = np.clip(start, robot.limits.lower, robot.limits.upper)  # to which plans move it
+        self.start = np.clip(start, robot.limits.lower, robot.limits.upper)  # as plans clip it
         held = {a.name: a for a in attached}
         self.frames = tuple(frame_of(robot, pose.frame, held) for pose in self.poses)
         self._numbers = [robot.link_frame(frame.link) for frame in self.frames]
@@ -127,7 +126,7 @@ def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject]) -> Fra
     """Return the frame of a hand, a link or a held object by name.
 
     Raises:
-        UnknownNameError: It is none of these.
+        UnknownNameError: There is no such frame.
     """
     if name in held:
         if held[name].contact is None:

@@ -17,7 +17,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ParameterError
-from apex_ompl.goals.alignment_errors import within
+from apex_ompl.goals.alignment import within
 from apex_ompl.loop.result import Outcome
 from apex_ompl.moving.dynamic_obstacles import Piece, ScriptedDynamicObstacles, clearance_in_time, prove_motion
 from apex_ompl.ompl.setup import workspace_goal
@@ -28,7 +28,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.checks import SAME_STATE
-from apex_ompl.timing.rests import AT_REST, is_at_rest
+from apex_ompl.timing.trajectory import AT_REST, is_at_rest
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_states
 

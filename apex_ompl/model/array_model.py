@@ -1,8 +1,11 @@
-"""A trained model evaluated by NumPy: ready without torch, which takes longer to import than most problems to solve.
+"""A trained model evaluated by NumPy and the kernel: ready without torch, whose import takes longer than most plans.
 
-It computes what torch does for models of a linear latent space and an MLP denoiser, with large matrices of weights in
-eight bits; names of weights are those of the torch module
+It evaluates models of a linear latent space and an MLP denoiser. Names of weights are those of the torch module
 :class:`apex_ompl.training.latent_diffusion.LatentDiffusion`, where the layers are explained.
+
+Large matrices of weights are int8 with a scale for each row: symmetric linear quantization (Jacob et al., CVPR 2018,
+with a zero point of 0). Reading weights from memory takes most of the time of a few proposals. NumPy's models compute
+with the bytes (:mod:`apex_ompl.kernel.compiled.dense_layer`), torch's with the expanded matrices.
 """
 
 from __future__ import annotations
@@ -22,15 +25,71 @@ from apex_ompl.model.config import OBSTACLE_SCENES, ModelConfig, key_shapes
 from apex_ompl.model.geometry import SHAPES, signed_distances
 from apex_ompl.model.guidance import Guidance, collision_cost
 from apex_ompl.model.proposals import TrajectoryModel
-from apex_ompl.model.quantization import SUFFIX, quantized
 from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER, ObstacleSet, Probes, Query
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer
 
+SUFFIX = ".scale"
+LEAST = 2**12  # size from which a matrix is quantized
+MOST = 127
 Single = NDArray[np.float32]
 STEP_SIZE = 128  # of the embedding of a step
 EPSILON = 1e-5  # of the layer normalization, as in torch
+
+
+def quantized(weights: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return weights whose large matrices of layers are int8, with scales of their rows as ``NAME.scale``.
+
+    Weights that are int8 already stay as they are.
+    """
+    found = {}
+    for name, values in weights.items():
+        if (
+            not name.endswith("weight")
+            or values.ndim != 2
+            or values.size < LEAST
+            or not np.issubdtype(values.dtype, np.floating)
+        ):
+            found[name] = values
+            continue
+        wide = values.astype(np.float32)
+        scale = np.maximum(np.abs(wide).max(axis=1), np.finfo(np.float32).tiny) / MOST
+        found[name] = np.round(wide / scale[:, None]).astype(np.int8)
+        found[name + SUFFIX] = scale
+    return found
+
+
+def is_scale(name: str, weights: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether a name is that of the scales of a matrix in eight bits."""
+    matrix = weights.get(name.removesuffix(SUFFIX)) if name.endswith(SUFFIX) else None
+    return matrix is not None and matrix.dtype == np.int8
+
+
+def check_scales(weights: Mapping[str, NDArray[Any]]) -> None:
+    """Check that there is a scale for each row of the matrices in eight bits.
+
+    Raises:
+        ValueError: Scales are missing, or are not one for each row.
+    """
+    for name, values in weights.items():
+        scale = weights.get(name + SUFFIX)
+        if values.dtype == np.int8 and (scale is None or scale.shape != values.shape[:1]):
+            raise ValueError(f"{name}: expected a scale for each row of a matrix in eight bits")
+
+
+def expanded(weights: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return weights with the matrices that are int8 as float32, without their scales.
+
+    Raises:
+        ValueError: Scales are missing, or are not one for each row.
+    """
+    check_scales(weights)
+    found = {name: values for name, values in weights.items() if not is_scale(name, weights)}
+    for name, values in found.items():
+        if values.dtype == np.int8:
+            found[name] = values.astype(np.float32) * weights[name + SUFFIX].astype(np.float32)[:, None]
+    return found
 
 
 def is_supported(config: ModelConfig) -> bool:
@@ -65,7 +124,7 @@ class ArrayModel(TrajectoryModel):
         self._shares = self.spline.line(np.zeros(1), np.ones(1))
 
     def one_thread(self) -> AbstractContextManager[None]:
-        """Let its networks compute by one thread inside a block; they always do."""
+        """Limit its networks to one thread inside a block; NumPy models always use one."""
         return nullcontext()
 
     def zeros(self, count: int) -> Single:
@@ -88,17 +147,17 @@ class ArrayModel(TrajectoryModel):
         center = np.array(WORKSPACE_CENTER, np.float32)
         if self.config.condition.point:
             parts.append(np.array([q.point for q in queries], np.float32) - center)
-        if self.sight is not None:
-            parts.append(self.sight.features(queries, kernel))
+        if self.scene_encoding is not None:
+            parts.append(self.scene_encoding.features(queries, kernel))
         if self.config.condition.scene in OBSTACLE_SCENES:
             start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
             probes = self.probes.positions(kernel, start, goal)
             features = [self._obstacle_features(q.obstacles, points) for q, points in zip(queries, probes, strict=True)]
             parts.append(np.array(features, np.float32))
-        return self._layers("encoder.phi", 3 if self.sight is not None else 2, np.concatenate(parts, axis=1))
+        return self._layers("encoder.phi", 3 if self.scene_encoding is not None else 2, np.concatenate(parts, axis=1))
 
     def refine(self, condition: Single, along: Single) -> Single:
-        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        """Return encoded conditions refined by features along estimated paths, shape (B, F)."""
         return condition + self._layers("encoder.psi", 3, along)
 
     def denoise(self, latent: Single, t: int, condition: Single) -> Single:
@@ -133,7 +192,7 @@ class ArrayModel(TrajectoryModel):
         return np.asarray(start)[:, None] + self._shares * (np.asarray(goal) - start)[:, None]
 
     def _obstacle_features(self, obstacles: ObstacleSet, probes: Single) -> Single:
-        """Return what the encoder sees of the obstacles of a query, shape (features,); probes have (L, P, 3)."""
+        """Return the obstacle features of a query, shape (features,), for probe points of shape (L, P, 3) [m]."""
         along, count = probes.shape[:2]
         center = np.array(WORKSPACE_CENTER, np.float32)
         position, size = (np.asarray(v, np.float32) for v in (obstacles.position, obstacles.size))
@@ -145,8 +204,8 @@ class ArrayModel(TrajectoryModel):
             distances = signed_distances(obstacles.shape, position, rotation, size, points)
             distances = np.clip(distances, -MAX_DISTANCE, MAX_DISTANCE) / np.float32(MAX_DISTANCE)
             parts += [(probes - center).ravel(), distances.min(axis=0, initial=1.0)]
-            looked_at = distances.reshape(-1, along, count)[:, [0, along // 2, -1]]
-            inputs.append(looked_at.reshape(-1, 3 * count))
+            few = distances.reshape(-1, along, count)[:, [0, along // 2, -1]]
+            inputs.append(few.reshape(-1, 3 * count))
         tokens = np.concatenate(inputs, axis=1)
         tokens = _silu(self._linear("encoder.thing.0", tokens))
         tokens = self._linear("encoder.thing.4", _silu(self._linear("encoder.thing.2", tokens)))
@@ -194,7 +253,7 @@ def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:
     if condition.scene == "distances":
         size += 4 * condition.along * config.probes
     hidden = 2 * condition.width
-    layers.append(("encoder.phi.0", size + config.seen, hidden))
+    layers.append(("encoder.phi.0", size + config.scene_features, hidden))
     if condition.scene == "clearances":
         layers += [("encoder.phi.2", hidden, hidden), ("encoder.phi.4", hidden, condition.out)]
     else:

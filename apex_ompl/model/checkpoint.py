@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +17,17 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_arrays
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.model.array_model import ArrayModel, is_supported, weight_shapes
+from apex_ompl.model.array_model import ArrayModel, check_scales, is_scale, is_supported, weight_shapes
 from apex_ompl.model.config import ModelConfig
 from apex_ompl.model.proposals import TrajectoryModel
-from apex_ompl.model.quantization import check_scales, is_scale
 from apex_ompl.util.files import BROKEN, is_file, path_text, read_file
 from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import StrictModel, read_json, validate
 
-if TYPE_CHECKING:
-    import torch
-
 SCHEMA = "apex-ompl/model/1"
 SHIPPED = Path(__file__).parent / "checkpoints"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-TORCH = "apex_ompl.training.torch_model"  # evaluates what NumPy cannot; by name, since this package knows no torch
+TORCH = "apex_ompl.training.torch_model"  # for models that NumPy cannot evaluate; by name, since model knows no torch
 PICKLES = (".pt", ".pth", ".ckpt", ".bin", ".pkl", ".pickle")
 
 
@@ -52,15 +48,15 @@ class CheckpointConfig(StrictModel):
 
 
 def load_model(
-    name: str | os.PathLike[str] = "apex", *, device: str | torch.device = "cpu", robot: str | None = None
+    name: str | os.PathLike[str] = "apex", *, device: Any = "cpu", robot: str | None = None
 ) -> TrajectoryModel:
     """Return a trained model.
 
-    On the CPU, NumPy evaluates a model that it can; torch is imported for others alone.
+    On the CPU, NumPy evaluates the models that it can; torch is imported only for the others.
 
     Args:
         name: Name of a checkpoint that ships, ``apex`` or ``apex-paper``, or a folder.
-        device: Device of torch's that it computes on.
+        device: Torch device that it computes on, or its name.
         robot: Name of the robot that the model must be for; by default any.
 
     Raises:

@@ -45,7 +45,7 @@ class LatentConfig(StrictModel):
 
 
 class ConditionConfig(StrictModel):
-    """Encoder of conditions, see ``apex_ompl.training.encoders.ConditionEncoder``.
+    """Encoder of conditions, see ``apex_ompl.training.networks.ConditionEncoder``.
 
     Attributes:
         scene: ``none``, ``set``, ``distances`` or ``clearances``.
@@ -91,7 +91,7 @@ class DenoiserConfig(StrictModel):
 
 
 class NoiseConfig(StrictModel):
-    """Diffusion process, see ``apex_ompl.model.schedule.NoiseSchedule``.
+    """Diffusion process, see ``apex_ompl.model.diffusion.NoiseSchedule``.
 
     Attributes:
         steps: Number of steps T.
@@ -122,7 +122,7 @@ class ModelConfig(StrictModel):
         robot: Name of the robot.
         joints: Its planned joints in state order.
         probes: Number of probe points on the robot.
-        arms: Numbers of arms and of their clusters of bodies that are seen at key states; 0 where none are.
+        arms: Numbers of arms and of their clusters of bodies with clearances at key states; 0 where none are.
         spline: Spline of the control points.
         latent: Latent space.
         condition: Encoder of conditions.
@@ -149,7 +149,7 @@ class ModelConfig(StrictModel):
         return self
 
     @property
-    def seen(self) -> int:
+    def scene_features(self) -> int:
         """Number of features of a scene ``clearances``, 0 of others."""
         condition = self.condition
         if condition.scene != "clearances":

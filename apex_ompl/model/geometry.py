@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from apex_ompl.types import Array
 
 Numbers = Any
-"""An array of NumPy or a tensor of torch; functions return what they are given."""
+"""An array of NumPy or a tensor of torch; functions return the kind that they are given."""
 
 SHAPES = ("box", "sphere", "cylinder", "capsule")
 """Shapes of obstacles. Sizes are edges; radius; or radius and length along z [m]."""

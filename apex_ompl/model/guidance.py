@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel
+from apex_ompl.model.diffusion import Estimate, NoiseSchedule, Predict
 from apex_ompl.model.geometry import Numbers, array_module
-from apex_ompl.model.sampler import Predict
-from apex_ompl.model.schedule import Estimate, NoiseSchedule
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer, check_name, check_number, check_positive
 
@@ -63,10 +62,10 @@ class Guidance:
 
 
 EQUATION_7 = Guidance(gamma=64.0, scaling="noise", active_below=0.5)
-"""Guidance as the paper has it, of the model apex-paper. The paper gives no gamma: with this one most proposals for
-validation problems are valid (benchmarks/model/guidance.py), without any hardly one."""
+"""Guidance of the paper, for the model apex-paper. The paper gives no gamma. With this one most proposals for
+validation problems are valid; without guidance hardly any is (benchmarks/model/guidance.py)."""
 GUIDANCES = {"clean": Guidance(), "noise": EQUATION_7}
-"""What is used of each scaling."""
+"""Parameters by scaling."""
 
 
 def collision_cost(kernel: Kernel, paths: Array, margin: float) -> tuple[Array, Array]:

@@ -1,48 +1,144 @@
-"""Primitives that together look like a grid of distances: what a model that sees shapes sees of meshes and points.
+"""Primitives that together approximate a grid of distances, for models that see shapes of meshes and points.
 
-Repair begins among them, too: distances from them are smooth where those from voxels are rough.
+Repair starts among them, too: distances from primitives are smooth where those from voxels are rough.
 
-The nodes near a surface, and those that it encloses, are taken apart into connected regions. A region that looks like a
-box, ball or cylinder becomes that; in the others boxes along the axes of the grid grow from nodes until nearly all are
-in one. So the same furniture gives much the same shapes whether it comes as boxes, as a mesh, as points on its surface
-or as voxels. Nothing is proved by them.
+The nodes near a surface, and those that it encloses, are divided into connected regions. A region close to a box, a
+ball or a cylinder of the same second moments becomes that primitive. In the other regions boxes along the axes of the
+grid grow from nodes until nearly all nodes are in one. The same furniture therefore gives similar primitives whether it
+comes as boxes, as a mesh, as points on its surface or as voxels. Nothing is proved by them.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER
+from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, SPHERE
 from apex_ompl.kernel.compiled.grid_distance import SLACK
 from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.distance_grid import BAND, DistanceGrid
 from apex_ompl.kernel.scene_builder import Primitive, primitive, scene_tables
 from apex_ompl.kernel.tables import SceneTables
-from apex_ompl.model.solid_fit import THINNEST, Solid, solids_like, turned_to
+from apex_ompl.model.geometry import signed_distances
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.weak_cache import weakly_cached
 
-MOST_NODES, MOST_NODES_OF_SOLIDS = 1_000_000, 250_000  # that are looked at; of finer grids every other or third
-INSIDE = 3.0  # distance inside of a surface, in spacings, by which it is known to enclose a solid
-CLOSE = 0.008  # nodes are at least so far from each other among points, which are to be one surface [m]
+PLACES, POINTS = 3000, 300  # most points for moments, and for orientations
+THINNEST = 0.002  # least half side or radius [m]
+TURNS = np.radians(np.arange(0.0, 90.0, 5.0))
+ORDERS = [list(order) for order in itertools.permutations(range(3))]
+FINE_TURNS = np.radians(np.arange(-4.0, 4.5, 1.0))
+MOST_NODES, MOST_NODES_OF_SOLIDS = 1_000_000, 250_000  # in use; of finer grids every second or third
+INSIDE = 3.0  # depth below a surface, in spacings, from which it is known to enclose a solid
+CLOSE = 0.008  # least distance of nodes among points, so that the points form one surface [m]
 MORE = 1.15  # distance in spacings up to which nodes count as occupied where distances are not exact
 MOST_SHAPES = 48  # of a grid
-ALIKE = 0.7  # volume of the intersection of a region and its primitive over that of their union, at least
-HOLE = 0.03  # nodes of a primitive and not of its region are at most so far from the surface [m]
-FEW = 8  # nodes of a region that is a box whatever its form
-RIM = 300  # nodes of a border by which a primitive is judged
+ALIKE = 0.7  # least intersection over union of the volumes of a region and its primitive
+HOLE = 0.03  # largest distance from the surface of nodes of a primitive outside of its region [m]
+FEW = 8  # most nodes of a region that becomes a box whatever its form
+RIM = 300  # border nodes by which a primitive is compared with its region
 SAMPLES = 1500  # nodes by which a region and a primitive are compared
-BOXY = 1.25  # by which a box must fit better than a round solid, which voxels make look like a box
-LEAST_GAIN = 0.03  # side of a cube that has the volume of what the next box must hold at least [m]
-RING = 0.006  # around a box there is no other to be looked for [m]
-LONG = 3.0  # sides of a bar, at least
-LAYER = 0.96  # share of a layer of nodes that must be occupied for a box to grow by it
+BOXY = 1.25  # factor by which a box must fit better than a round solid, since voxels make that look like a box
+LEAST_GAIN = 0.03  # side of a cube with the least volume that the next box must cover [m]
+RING = 0.006  # width around a box in which no other box starts [m]
+LONG = 3.0  # least ratio of the sides of a bar
+LAYER = 0.96  # least occupied share of a layer of nodes by which a box grows
 SEEDS = 10  # nodes from which boxes grow
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A box, a ball or a cylinder.
+
+    Attributes:
+        kind: BOX, SPHERE or CYLINDER.
+        rotation: From its frame, shape (3, 3).
+        position: Of its center, shape (3,) [m].
+        size: Half edges; radius; or radius and half length along z; shape (3,), padded with 0 [m].
+    """
+
+    kind: int
+    rotation: Array
+    position: Array
+    size: Array
+
+    def distances(self, places: Array) -> Array:
+        """Return signed distances of places, shape (N, 3) [m]."""
+        rows = (np.array([self.kind]), self.position[None], self.rotation[None], self.size[None])
+        return np.asarray(signed_distances(*rows, places[None])[0])
+
+
+def solids_like(places: Array, spacing: float, less: float) -> list[Solid]:
+    """Return boxes, a ball and cylinders with the second moments of given points.
+
+    Args:
+        places: Nodes of a lattice inside of a solid, shape (N, 3) [m].
+        spacing: Spacing of the lattice [m].
+        less: Length by which radii and half sides are reduced [m].
+    """
+    places = places[:: max(1, len(places) // PLACES)]
+    middle = places.mean(axis=0)
+    spread = np.cov(places.T) + spacing**2 / 12.0 * np.eye(3)
+    variances, axes = np.linalg.eigh(spread)
+
+    def fit(kind: int, rotation: Array, *size: float) -> Solid:
+        row = np.zeros(3)
+        row[: len(size)] = np.maximum(np.array(size) - less, THINNEST)
+        return Solid(kind, rotation, middle, row)
+
+    fits = [
+        fit(BOX, np.eye(3), *np.sqrt(3.0 * np.diag(spread))),
+        fit(SPHERE, np.eye(3), math.sqrt(5.0 * variances.mean())),
+    ]
+    some = places[:: max(1, len(places) // POINTS)] - middle
+    for z in range(3):
+        x, y = (z + 1) % 3, (z + 2) % 3
+        frame = np.stack([axes[:, x], axes[:, y], axes[:, z]], axis=1)
+        frame[:, 0] *= np.sign(np.linalg.det(frame))
+        radius = math.sqrt(2.0 * (variances[x] + variances[y]))
+        fits.append(fit(CYLINDER, turned_to(frame[:, 2]), radius, math.sqrt(3.0 * variances[z])))
+        turned = _nearest_axes(frame @ _smallest_rectangle(some @ frame))
+        fits.append(fit(BOX, turned, *np.sqrt(3.0 * np.diag(turned.T @ spread @ turned))))
+    return fits
+
+
+def turned_to(axis: Array) -> Array:
+    """Return the smallest rotation, shape (3, 3), that takes the z axis to an axis or its opposite."""
+    x, y, z = axis if axis[2] >= 0.0 else -axis
+    return np.array(
+        [
+            [1.0 - x * x / (1.0 + z), -x * y / (1.0 + z), x],
+            [-x * y / (1.0 + z), 1.0 - y * y / (1.0 + z), y],
+            [-x, -y, z],
+        ]
+    )
+
+
+def _nearest_axes(rotation: Array) -> Array:
+    """Return the rotation nearest to the identity among those with the same axes in any order and direction."""
+    order = max(ORDERS, key=lambda some: float(np.abs(np.diag(rotation[:, some])).sum()))
+    found = rotation[:, order]
+    found = found * np.where(np.diag(found) < 0.0, -1.0, 1.0)
+    if np.linalg.det(found) < 0.0:
+        found[:, int(np.abs(np.diag(found)).argmin())] *= -1.0
+    return found
+
+
+def _smallest_rectangle(local: Array) -> Array:
+    """Return the rotation about z, shape (3, 3), after which the rectangle around points, shape (N, 3), is smallest."""
+    best = 0.0
+    for turns in (TURNS, FINE_TURNS):
+        angles = best + turns
+        axes = np.stack([np.cos(angles), np.sin(angles)])
+        sides = np.ptp(local[:, :2] @ axes, axis=0) * np.ptp(local[:, :2] @ np.stack([-axes[1], axes[0]]), axis=0)
+        best = float(angles[sides.argmin()])
+    c, s = math.cos(best), math.sin(best)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +164,9 @@ class _Nodes:
 
     Attributes:
         spacing: Of these nodes [m].
-        gap: Signed distances from what the grid is about, exact near it, shape (nx, ny, nz) [m].
+        gap: Signed distances of the grid, exact near the surface, shape (nx, ny, nz) [m].
         reach: Distance up to which nodes count as occupied [m].
-        label: OUTSIDE, or OCCUPIED and the number of a region from 1 on, likewise.
+        label: OUTSIDE, or OCCUPIED plus the number of a region from 1 on, shape (nx, ny, nz).
     """
 
     spacing: float
@@ -115,7 +211,7 @@ class _Nodes:
 
 @weakly_cached
 def fitted_shapes(grid: DistanceGrid) -> FittedShapes:
-    """Return primitives that together look like what a grid is about."""
+    """Return primitives that together approximate a grid of distances."""
     nodes = _Nodes.of(grid)
     border = nodes.on_border()
     places = np.argwhere(nodes.label > OCCUPIED)
@@ -141,7 +237,7 @@ def fitted_shapes(grid: DistanceGrid) -> FittedShapes:
 
 
 def primitives_like(solid: Primitive) -> list[Primitive]:
-    """Return primitives that together look like a grid at a pose; one that is no grid as it is."""
+    """Return primitives that together approximate a grid at a pose; any other primitive is returned as it is."""
     if solid.grid is None:
         return [solid]
     fit, found = fitted_shapes(solid.grid), []
@@ -154,7 +250,7 @@ def primitives_like(solid: Primitive) -> list[Primitive]:
 
 @weakly_cached
 def scene_of_primitives(tables: SceneTables) -> SceneTables | None:
-    """Return a scene in which primitives stand for grids; None where there are no grids."""
+    """Return a scene in which primitives replace grids; None where there are no grids."""
     if all(grid is None for grid in tables.grids):
         return None
     owners = tables.arrays.owner.tolist()
@@ -164,10 +260,10 @@ def scene_of_primitives(tables: SceneTables) -> SceneTables | None:
 
 
 def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> Solid | None:
-    """Return the primitive that looks like connected nodes, shape (N, 3), or None.
+    """Return the primitive that approximates connected nodes, shape (N, 3), or None.
 
-    Of solids with the same second moments, that do not close a hole, it is the one from whose surface the nodes at the
-    region's border are as far as from the grid's.
+    Candidates are solids with the same second moments that do not close a hole. The one is chosen for which the
+    distances of the region's border nodes from its surface are closest to those of the grid.
     """
     low, high = part.min(axis=0), part.max(axis=0)
     if len(part) <= FEW:
@@ -198,7 +294,7 @@ def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> Solid | None:
 
 
 def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[Solid]:
-    """Return boxes along the axes that hold nearly all nodes that are not zero; ``left`` is used up."""
+    """Return boxes along the axes that cover nearly all nonzero nodes of ``left``, which is overwritten."""
     least, ring = max(FEW, (LEAST_GAIN / nodes.spacing) ** 3), max(1, round(RING / nodes.spacing))
     sums = np.zeros(tuple(n + 1 for n in left.shape), np.int64)
     add_up(left, sums)
@@ -219,7 +315,7 @@ def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[Soli
 
 
 def _open_part(uncovered: Flags, box: Integers) -> Integers:
-    """Return a box of nodes without the ends that lie in other boxes, as two walls that meet are mostly described."""
+    """Return a box of nodes cut to its part outside of other boxes, so that two walls that meet do not overlap."""
     inside = uncovered[tuple(slice(a, b) for a, b in box.T.tolist())]
     ends = []
     for axis in range(3):
@@ -231,8 +327,8 @@ def _open_part(uncovered: Flags, box: Integers) -> Integers:
 def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> Solid:
     """Return the box of nodes from the first row of ``box``, shape (2, 3), to before the second, or a cylinder.
 
-    A long box of nearly square section may have grown inside of a round bar. In the middle of its length the nodes at
-    the bar's border tell.
+    A long box of nearly square section may have grown inside of a round bar. The border nodes in the middle of its
+    length decide which of the two fits better.
     """
     found = _box_of(nodes, box[0], box[1] - 1)
     axis = int(found.size.argmax())
@@ -262,7 +358,7 @@ def _box_or_bar(nodes: _Nodes, border: Flags, box: Integers) -> Solid:
 
 
 def _box_of(nodes: _Nodes, low: Integers, high: Integers) -> Solid:
-    """Return the box whose outermost nodes are given, its sides put where the surface is, by the nodes' distances."""
+    """Return the box with given outermost nodes, its sides moved to the surface by the distances of these nodes."""
     inside = tuple(slice(int(a), int(b) + 1) for a, b in zip(low, high, strict=True))
     ends = nodes.spacing * np.stack([low, high]).astype(float)
     for axis in range(3):

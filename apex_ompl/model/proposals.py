@@ -1,4 +1,4 @@
-"""A trained model as planners use it: candidate paths for a query."""
+"""Proposals of a trained model: candidate paths for a query."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.products import product
 from apex_ompl.model.config import ModelConfig
+from apex_ompl.model.diffusion import SAMPLERS, Callback, Estimate, NoiseSchedule, Predict, ddpm, noise_like
 from apex_ompl.model.geometry import Numbers
 from apex_ompl.model.guidance import Guidance, guided
 from apex_ompl.model.query import Probes, Query
-from apex_ompl.model.sampler import SAMPLERS, Callback, Predict, ddpm, noise_like
-from apex_ompl.model.scene_encoding import KeyStates, Sight
-from apex_ompl.model.schedule import Estimate, NoiseSchedule
+from apex_ompl.model.scene_encoding import KeyStates, SceneEncoding
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, fields_line, one_line
@@ -85,8 +84,8 @@ class TrajectoryModel(ABC):
         about: Record of the training.
         spline: Spline of the control points.
         schedule: Noise schedule.
-        probes: Points of the robot whose distances to the obstacles it sees.
-        sight: What it sees of a scene ``clearances``, None of others.
+        probes: Points of the robot whose distances to the obstacles are features.
+        scene_encoding: Features of a scene ``clearances``; None for other scenes.
         sampling: Default sampling.
     """
 
@@ -97,12 +96,12 @@ class TrajectoryModel(ABC):
         self.config, self.about, self.probes = config, dict(about), probes
         self.spline = Spline(**config.spline.model_dump())
         self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
-        self.sight = Sight(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
+        self.scene_encoding = SceneEncoding(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
         self.sampling = Sampling(**config.sampling.model_dump())
-        self._looked_at = self.spline.basis(probes.shares)
+        self._along_basis = self.spline.basis(probes.shares)
 
     def __repr__(self) -> str:
-        """Return the robot, the size of the paths, and what the model sees of a scene."""
+        """Return the robot, the size of the paths, and the kind of scene encoding."""
         size = f"{self.spline.points} control points of {counted(len(self.config.joints), 'joint')}"
         scene = f"scene {self.config.condition.scene!r}"
         return one_line(type(self).__name__, f"robot {self.config.robot!r}", size, scene)
@@ -114,7 +113,7 @@ class TrajectoryModel(ABC):
 
     @abstractmethod
     def one_thread(self) -> AbstractContextManager[None]:
-        """Let its networks compute by one thread inside a block."""
+        """Limit its networks to one thread inside a block."""
 
     @abstractmethod
     def zeros(self, count: int) -> Numbers:
@@ -130,7 +129,7 @@ class TrajectoryModel(ABC):
 
     @abstractmethod
     def refine(self, condition: Numbers, along: NDArray[np.float32]) -> Numbers:
-        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        """Return encoded conditions refined by features along estimated paths, shape (B, F)."""
 
     @abstractmethod
     def denoise(self, latent: Numbers, t: int, condition: Numbers) -> Numbers:
@@ -205,10 +204,10 @@ class TrajectoryModel(ABC):
         )
 
     def _check(self, queries: Sequence[Query], kernel: Kernel) -> None:
-        """Check that queries are of the model's robot.
+        """Check that queries are of the model's robot, with finite numbers.
 
         Raises:
-            ParameterError: They are not, or numbers are not finite.
+            ParameterError: They are not.
         """
         config = self.config
         if (kernel.robot.name, kernel.robot.joint_names) != (config.robot, config.joints):
@@ -227,7 +226,7 @@ class TrajectoryModel(ABC):
     ) -> Proposals:  # fmt: skip
         """Return the paths that the reverse process makes of noisy latent vectors ``first`` at step ``top``.
 
-        A model that sees its own estimate sees the paths of ``known`` latent vectors at first, if there are any.
+        A model that sees its own estimate starts with the paths of ``known`` latent vectors, if there are any.
         """
         self._check(queries, kernel)
         clock, each = StageClock("condition", "network", "guidance", "decode"), len(first) // len(queries)
@@ -245,11 +244,11 @@ class TrajectoryModel(ABC):
                 with clock.within("guidance"):
                     return self.score(clean, kernel, ends, sampling.guidance)
 
-            def look(clean: Numbers) -> Numbers:
+            def refined(clean: Numbers) -> Numbers:
                 return self.refine(condition, self._along(queries, kernel, self.control(clean, ends)))
 
-            seen = look if self.config.condition.refined else None
-            predict = self._predict(condition, seen, known)
+            refine = refined if self.config.condition.refined else None
+            predict = self._predict(condition, refine, known)
             predict = guided(predict, score, self.schedule, sampling.guidance, self.config.noise.most)
             times = self.schedule.timesteps(sampling.steps, top)
             extra: dict[str, Any] = {} if callback is None else {"callback": callback}
@@ -265,29 +264,32 @@ class TrajectoryModel(ABC):
         return Proposals(control, latent, clock.seconds)
 
     def _along(self, queries: Sequence[Query], kernel: Kernel, control: Array) -> NDArray[np.float32]:
-        """Return what the model sees along paths of queries, as many of each: shape (B, features)."""
-        assert self.sight is not None
+        """Return the features along paths, as many of each query: shape (B, features)."""
+        assert self.scene_encoding is not None
         limits, each = kernel.robot.arrays, len(control) // len(queries)
-        paths = product(self._looked_at, np.clip(control, limits.lower, limits.upper))
+        paths = product(self._along_basis, np.clip(control, limits.lower, limits.upper))
         rows = [
-            self.sight.along(kernel, paths[k * each : (k + 1) * each], *query.seen()) for k, query in enumerate(queries)
+            self.scene_encoding.along(kernel, paths[k * each : (k + 1) * each], *query.obstacle_tables())
+            for k, query in enumerate(queries)
         ]
         return np.concatenate(rows)
 
-    def _predict(self, condition: Numbers, look: Callable[[Numbers], Numbers] | None, known: Numbers | None) -> Predict:
+    def _predict(
+        self, condition: Numbers, refine: Callable[[Numbers], Numbers] | None, known: Numbers | None
+    ) -> Predict:
         """Return the denoiser as samplers call it.
 
         Args:
             condition: Encoded conditions.
-            look: For a model that sees its estimates, returns encoded conditions with what lies along their paths.
-            known: Clean samples that are seen at first.
+            refine: For a model that sees its estimates, returns conditions refined by features along their paths.
+            known: Clean samples that take the place of the first estimate.
         """
         noise, last = self.config.noise, known
 
         def predict(sample: Numbers, t: int) -> Estimate:
             nonlocal last
-            seen = condition if look is None or last is None else look(last)
-            output = self.denoise(sample, t, seen)
+            refined = condition if refine is None or last is None else refine(last)
+            output = self.denoise(sample, t, refined)
             estimate = self.schedule.estimate(noise.prediction, sample, output, t)
             last = estimate.clean
             return self.schedule.clipped(estimate, sample, t, noise.most)

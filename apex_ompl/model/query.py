@@ -26,10 +26,10 @@ KINEMATICS_BATCH = 1024
 """Number of paths whose joint frames are in memory at the same time."""
 
 WORKSPACE_CENTER = (0.4, 0.0, 0.6)
-"""Origin of all points that a model sees [m]."""
+"""Origin of all points among the features of a model [m]."""
 
 MAX_DISTANCE = 0.4
-"""Distances that a model sees are clipped here [m]."""
+"""Largest distance among the features of a model; larger ones are clipped [m]."""
 
 HALF_SPACE_BOX = np.array([3.0, 3.0, 0.5])
 """Half edges of the box that represents a half-space [m]."""
@@ -67,8 +67,7 @@ class ObstacleSet:
     def from_scene(cls, tables: SceneTables, chosen: Flags) -> ObstacleSet:
         """Return some obstacles of a kernel scene; a half-space becomes a box larger than the workspace.
 
-        A grid of distances becomes primitives that look like what it is about, see
-        :mod:`apex_ompl.model.primitive_fit`.
+        A grid of distances becomes primitives that approximate it, see :mod:`apex_ompl.model.primitive_fit`.
 
         Args:
             tables: The scene.
@@ -118,8 +117,8 @@ class Query:
         goal: Shape (dof,) [rad].
         point: Obstacle point nearest to the robot at the start, shape (3,) [m].
         known: The obstacles as primitives, or None where there is a scene.
-        scene: The same as tables of the kernel, or None, and which of their solids are no fixtures.
-        held: Links that hold something, and the corners of boxes around it in their frames, each of shape (2, 3) [m].
+        scene: The obstacles as tables of the kernel, with a flag for each solid that is no fixture; or None.
+        held: Links that hold an object, and the corners of the box around it in their frames, each of shape (2, 3) [m].
     """
 
     start: Array
@@ -133,26 +132,26 @@ class Query:
 
     @cached_property
     def obstacles(self) -> ObstacleSet:
-        """The obstacles without fixtures such as tables; made where something asks for them."""
+        """The obstacles without fixtures such as tables, computed when they are first used."""
         if self.known is not None:
             return self.known
         assert self.scene is not None
         return ObstacleSet.from_scene(*self.scene)
 
-    def seen(self) -> tuple[SceneTables, Flags | None]:
-        """Return tables of the obstacles, and which of their solids are obstacles, None for all."""
+    def obstacle_tables(self) -> tuple[SceneTables, Flags | None]:
+        """Return tables of the obstacles, and a flag for each of their solids that is no fixture; None for all."""
         return (self.obstacles.tables(), None) if self.scene is None else self.scene
 
 
 class Probes:
-    """Probe points: P points fixed to the robot's links, whose distances to the obstacles the encoder sees.
+    """Probe points: P points fixed to the robot's links, whose distances to the obstacles are features.
 
     By default they are the centers of the bounding balls of the sphere cover's clusters.
 
     Attributes:
         joint: Joint that carries each point, an index into the kernel's tables, shape (P,).
         offset: Positions in the joints' frames, shape (P, 3) [m].
-        shares: Where along the straight line from start to goal they are looked at, shape (L,) in 0..1.
+        shares: Parameters of the straight line from start to goal at which they are placed, shape (L,) in 0..1.
     """
 
     def __init__(self, joint: NDArray[np.int64], offset: Array, along: int) -> None:

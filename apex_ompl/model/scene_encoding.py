@@ -1,16 +1,16 @@
-"""What a model of ``scene="clearances"`` sees: distances alone, alike whatever the obstacles are made of.
+"""Scene encoding of models with ``scene="clearances"``: distances alone, whatever geometry the obstacles are given as.
 
-The vector of features of a query is, one behind the other:
+The features of a query are the concatenation of
 
 - the clearance of each arm from the obstacles at K key states, shape (K, A), after PRESTO (arXiv 2409.16012);
 - positions of the P probe points at L states along the straight line from start to goal, shape (L, P, 3), their signed
-  distances from the nearest obstacle, shape (L, P), the gradients of these, shape (L, P, 3), and how they push the
-  joints, shape (L, dof), see :meth:`apex_ompl.kernel.Kernel.joint_pushes`;
-- a box around what each hand holds, in the frame of the link that holds it, shape (H, 7): whether there is one, its
-  center and its half edges.
+  distances from the nearest obstacle, shape (L, P), the gradients of these, shape (L, P, 3), and the generalized forces
+  on the joints, shape (L, dof), see :meth:`apex_ompl.kernel.Kernel.joint_pushes`;
+- a box around the objects that each hand holds, in the frame of the holding link, shape (H, 7): whether there is one,
+  its center and its half edges.
 
-All are scaled to about -1..1. An arm is what moves at one joint of the world; at key states it is seen as balls around
-pieces of its links, with the fingers half closed and without held objects.
+All are scaled to about -1..1. An arm is the set of bodies that move with one joint of the world. At key states it is
+represented by balls around pieces of its links, with the fingers half closed and without held objects.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from apex_ompl.types import Array, Flags
 
 ROUNDS = 10  # of Lloyd's algorithm, which divides a cluster's spheres among its pieces
 KEY_RANGE = 0.3  # clearances at key states are clipped here [m]
-REACH = 0.2  # distance of a probe point from an obstacle at which it is pushed no more [m]
+REACH = 0.2  # distance of a probe point from an obstacle from which its force is zero [m]
 HELD_SIZE = 0.2  # scale of held objects [m]
 HALF = 2.0**-11  # relative rounding of half precision, in which checkpoints store balls
 CANDIDATES = 8  # states from which a key state is chosen
@@ -71,7 +71,7 @@ class KeyStates:
 
 
 def arms(robot: RobotTables) -> list[NDArray[np.int64]]:
-    """Return the clusters of bodies of each arm that meet obstacles; an arm is what moves at one joint of the world."""
+    """Return the clusters of bodies of each arm that can meet obstacles; an arm moves with one joint of the world."""
     a = robot.arrays
     base = np.arange(len(a.joint_parent))
     for joint in range(1, len(base)):
@@ -143,7 +143,7 @@ def _ball(points: Array, radii: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
+class SceneEncoding:
     """Features of queries by a model's key states, probes and hands.
 
     Attributes:
@@ -162,10 +162,10 @@ class Sight:
         balls, shares = self.balls(kernel), self.probes.shares[:, None]
         rows = []
         for query in queries:
-            scene, seen = query.seen()
+            scene, chosen = query.obstacle_tables()
             line = query.start + shares * (np.asarray(query.goal) - query.start)
-            along = self.along(kernel, line[None], scene, seen)[0]
-            rows.append(np.concatenate([self.at_keys(balls, scene, seen), along, self.held(query.held)]))
+            along = self.along(kernel, line[None], scene, chosen)[0]
+            rows.append(np.concatenate([self.at_keys(balls, scene, chosen), along, self.held(query.held)]))
         return np.array(rows, np.float32)
 
     def balls(self, kernel: Kernel) -> Array:
@@ -177,12 +177,12 @@ class Sight:
         return kept[1]
 
     @staticmethod
-    def at_keys(balls: Array, scene: SceneTables, seen: Flags | None) -> NDArray[np.float32]:
+    def at_keys(balls: Array, scene: SceneTables, chosen: Flags | None) -> NDArray[np.float32]:
         """Return the features of key states, shape (K * A,), whose balls :meth:`KeyStates.placed` gives."""
-        found = group_clearances(scene, balls, KEY_RANGE, seen)
+        found = group_clearances(scene, balls, KEY_RANGE, chosen)
         return (np.maximum(found, -KEY_RANGE) / KEY_RANGE).astype(np.float32)
 
-    def along(self, kernel: Kernel, paths: Array, scene: SceneTables, seen: Flags | None) -> NDArray[np.float32]:
+    def along(self, kernel: Kernel, paths: Array, scene: SceneTables, chosen: Flags | None) -> NDArray[np.float32]:
         """Return the features along paths of L states each, shape (B, L, dof) [rad]: shape (B, features).
 
         Of the kernel only the kinematics are used.
@@ -191,7 +191,7 @@ class Sight:
         frames = rotation, origin = kernel.joint_frames(paths.reshape(-1, paths.shape[-1]))
         points = np.einsum("npij,pj->npi", rotation[:, probes.joint], probes.offset, order="C")
         points += origin[:, probes.joint]
-        distances, gradients = nearest_points(scene, points.reshape(-1, 3), MAX_DISTANCE, seen)
+        distances, gradients = nearest_points(scene, points.reshape(-1, 3), MAX_DISTANCE, chosen)
         found = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
         pushed = kernel.joint_pushes(frames, probes.joint, points, found, REACH)
         near = np.maximum(distances, -MAX_DISTANCE) / MAX_DISTANCE

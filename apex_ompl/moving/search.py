@@ -20,7 +20,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing, vector
 from apex_ompl.timing import Trajectory
-from apex_ompl.timing.moving_start import between
+from apex_ompl.timing.ruckig_method import between
 from apex_ompl.types import Array
 
 MOTIONS = MotionSettings(samples=2)

@@ -1,4 +1,4 @@
-"""Candidate paths: repaired by the optimizer, the most promising one first."""
+"""Candidate paths, repaired by the optimizer in order of priority."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from apex_ompl.util.display import fields_line
 
 ROUND, ROUNDS = 4, 12  # optimizer steps in a round of repair, and rounds a candidate has at most
 SOFT_ROUNDS = 2  # the last rounds, with still less weight on the speed term
-ROUGH_ROUNDS = 2  # of these, the first, among primitives that look like the obstacles
-REPAIR_STIFFNESS = 0.3  # factor on the settings' stiffness: clear comes before short
+ROUGH_ROUNDS = 2  # the first rounds, among primitives that approximate the obstacles
+REPAIR_STIFFNESS = 0.3  # factor on the settings' stiffness in repair, where clearance matters more than length
 PENALTY = 3.0  # factor on the priority of a candidate for every round spent on it
 STEPS_PER_PATH = 16  # on average
 CLEAR = 0.005  # clearance at the samples at which a round ends early [m]
-MIN_CLEARANCE = -0.005  # at the samples, for the full check; spheres protrude from what they cover [m]
+MIN_CLEARANCE = -0.005  # at the samples, for the full check; spheres protrude from the bodies they cover [m]
 
 
 @dataclass
@@ -29,14 +29,14 @@ class Candidate:
 
     Attributes:
         control: Control points, shape (points, dof).
-        origin: Name of what made it.
+        origin: Name of its source.
         clearance_cost: Part of its cost that is due to clearance.
         clearance: Smallest clearance at the samples [m].
         damping: Damping of the next step.
         rounds: Number of rounds of repair that it had.
-        exact: Whether repair among what looks like the obstacles is over.
+        exact: Whether repair is among the obstacles, and no longer among primitives that approximate them.
         fine: Whether it is sampled more densely.
-        given_up: Whether repair has nothing left to try on it.
+        given_up: Whether it is not repaired any further.
     """
 
     control: Array
@@ -63,8 +63,8 @@ class CandidatePool:
     Candidates are checked when they are added. Repair improves the one with the least priority value by a few
     optimizer steps, and checks it again as soon as it is nearly clear at its samples. A candidate that is clear at the
     samples and still invalid is sampled more densely. In the last rounds of a candidate the speed term counts less.
-    Where there are primitives that look like the obstacles, first costs and rounds of repair are among these; what is
-    clear there, or still is not after ``ROUGH_ROUNDS``, goes on among the obstacles.
+    Where there are primitives that approximate the obstacles, the first costs and rounds of repair are among these. A
+    candidate goes on among the obstacles once it is clear there, or after ``ROUGH_ROUNDS``.
 
     Attributes:
         candidates: All candidates.
@@ -82,10 +82,10 @@ class CandidatePool:
             optimizer: Improves them.
             kernel: The robot among its obstacles.
             is_valid: Full check; called with the states of a path.
-            is_wanted: Further condition on valid candidates; those that fail it are given up.
-            collides: Quick test of candidates that are not clear at their samples: whether they are surely not valid.
-            rough: Returns the robot among primitives that look like its obstacles, if there are any; asked once, when
-                there are candidates.
+            is_wanted: Further condition on valid candidates; those that fail it are not repaired any further.
+            collides: Quick test that proves a candidate invalid, for those that are not clear at their samples.
+            rough: Returns the robot among primitives that approximate its obstacles, if there are any; called once,
+                when there are candidates.
         """
         self._optimizer, self._kernel, self._is_valid, self._is_wanted = optimizer, kernel, is_valid, is_wanted
         self._collides, self._make_rough = collides, rough
@@ -120,8 +120,8 @@ class CandidatePool:
         """Improve candidates until one is valid.
 
         Args:
-            steps: Largest number of steps in all.
-            stop: Asked between rounds whether to give up.
+            steps: Largest total number of steps.
+            stop: Called between rounds; True ends the search.
 
         Returns:
             The valid candidate, or None.
@@ -167,14 +167,14 @@ def first_valid(
     optimizer: Optimizer, kernel: Kernel, control: ArrayLike, is_valid: Check,
     stop: Callable[[], bool] = lambda: False,
 ) -> Array | None:  # fmt: skip
-    """Return control points, shape (points, dof), of the first of some paths that comes out valid, or None.
+    """Return control points, shape (points, dof), of the first path that is valid after repair, or None.
 
     Args:
-        optimizer: Improves them, by ``STEPS_PER_PATH`` steps for each and some more.
+        optimizer: Improves them, by ``STEPS_PER_PATH`` steps for each path and for two more.
         kernel: The robot among its obstacles.
-        control: Where to start from, shape (B, points, dof).
-        is_valid: Decides; called with the states of a path.
-        stop: Asked between rounds whether to give up.
+        control: Initial control points, shape (B, points, dof).
+        is_valid: Full check; called with the states of a path.
+        stop: Called between rounds; True ends the search.
 
     Raises:
         ParameterError: Control points of another shape.

@@ -19,8 +19,8 @@ from apex_ompl.util.validation import check_integer, check_positive
 class Path:
     """Path in joint space, from planner to time parameterization.
 
-    Planners check and return ``states``, to be joined by straight lines. A path that was optimized keeps the B-spline
-    that its states were taken from.
+    Planners check and return ``states``, joined by straight lines. An optimized path also has the B-spline from which
+    its states were sampled.
 
     Attributes:
         states: Waypoints, shape (N, dof) [rad; synergies 0..1].
@@ -36,7 +36,7 @@ class Path:
         """Check the shapes.
 
         Raises:
-            ParameterError: The states have not the shape (N, dof), or there is only one of spline and control points.
+            ParameterError: The states are not of shape (N, dof), or only one of spline and control points is given.
         """
         if np.ndim(self.states) != 2 or not len(self.states):
             raise ParameterError("path", np.shape(self.states), "states of shape (N, dof)")
@@ -64,7 +64,7 @@ class Path:
         return path_length(self.states)
 
     def __repr__(self) -> str:
-        """Return the numbers of states and joints, and what the path is."""
+        """Return the numbers of states and joints, and the kind of the path."""
         return f"Path({len(self)} states, {self.dof} joints, {'polyline' if self.spline is None else 'B-spline'})"
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""Paths as clamped B-splines: a few control points stand for a path of many states."""
+"""Paths as clamped B-splines: a few control points represent a path of many states."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from apex_ompl.util.arrays import distinct
 from apex_ompl.util.validation import check_integer, check_path
 
 FIT_SAMPLES = 1025
-ROUGHNESS = 1e-9  # of the third derivative, where a fit would leave control points open
+ROUGHNESS = 1e-9  # weight of the squared third derivative, so that a fit determines all control points
 
 
 @dataclass(frozen=True)
 class Spline:
     """Clamped B-splines over [0, 1] with even knots, as motion planning diffusion uses them (Carvalho et al. 2024).
 
-    A curve lies in the convex hull of its control points, so that control points inside limits keep all of it inside.
-    The first and the last control point are the ends. Where more are pinned to them, as many derivatives vanish there:
-    with 3 at each end the curve begins and ends at rest, without acceleration.
+    A curve lies in the convex hull of its control points, so it is inside limits where its control points are. The
+    first and the last control point are the ends. With k control points pinned to an end, k - 1 derivatives vanish
+    there: with 3 the curve starts and ends at rest, without acceleration.
 
     Attributes:
         points: Number of control points, pinned ones included.
@@ -42,7 +42,7 @@ class Spline:
         """Check the numbers.
 
         Raises:
-            ParameterError: There are too few points, states or pinned points, or nothing is left free.
+            ParameterError: There are too few points, states or pinned points, or no free control points.
         """
         for name, low in (("degree", 1), ("pinned", 1), ("states", 2)):
             object.__setattr__(self, name, check_integer(getattr(self, name), name, low))
@@ -57,7 +57,7 @@ class Spline:
 
     @property
     def inner(self) -> slice:
-        """Where the free control points are among all."""
+        """Slice of the free control points among all."""
         return slice(self.pinned, self.points - self.pinned)
 
     @property
@@ -87,7 +87,7 @@ class Spline:
     def line(self, start: ArrayLike, goal: ArrayLike) -> Array:
         """Return the control points of straight lines; ends of shape (..., dof), result (..., points, dof).
 
-        With one pinned point the motion is even.
+        With one pinned point the speed is even.
         """
         knots = self.knots
         along = np.array(
@@ -116,7 +116,7 @@ class Spline:
             ParameterError: Another number of control points.
         """
         points = self._checked(control)
-        # Each value is a mean of control points; rounding must not lead out of limits that all of them keep.
+        # Each value is a mean of control points; rounding must not exceed limits that all of them keep.
         states = np.clip(
             product(_grid(self, 0), points), points.min(axis=-2, keepdims=True), points.max(axis=-2, keepdims=True)
         )
@@ -146,9 +146,9 @@ class Spline:
         return total
 
     def fit(self, polyline: ArrayLike, lower: ArrayLike = -np.inf, upper: ArrayLike = np.inf) -> Fit:
-        """Return the curve nearest to a polyline, by least squares, its ends exact.
+        """Return the least-squares fit to a polyline, shape (N, dof), that is followed at even speed.
 
-        The polyline, shape (N, dof), is passed at even speed. Control points are put inside the limits.
+        The ends are exact, and control points are clipped to the limits.
 
         Raises:
             ParameterError: The polyline has another shape, or numbers that are not finite.
@@ -186,7 +186,7 @@ class Fit:
 
     Attributes:
         control: Its control points, shape (points, dof).
-        error: Bound on how far the curve and the polyline, passed at even speed, are apart [rad, max-norm].
+        error: Bound on the distance of the curve from the polyline at equal parameters [rad, max-norm].
     """
 
     control: Array

@@ -16,7 +16,7 @@ from apex_ompl.util.validation import check_array
 EXACT, APPROXIMATE = "EXACT_SOLUTION", "APPROXIMATE_SOLUTION"
 WITH_PATH = (EXACT, APPROXIMATE, "TIMING_FAILED")
 SAME_STATE = 1e-6  # files of motions and of goals may be rounded [rad]
-START_TOLERANCE = 2e-3  # from the start and, of unknown robots, the goal, whose joints may be moved to limits [rad]
+START_TOLERANCE = 2e-3  # from the start, and from the goal of an unknown robot, whose joints may be clipped [rad]
 LIMIT_TOLERANCE = 1e-6  # share by which a motion in a file may exceed a limit, as times are rounded
 
 
@@ -60,7 +60,7 @@ def check_plan(
         _check_end(name, states[0], starts, "start", START_TOLERANCE)
         if status != APPROXIMATE and len(goals):
             within = goals if known is None else known.within_limits(goals)
-            wanted = np.where(goals == starts, states[0], within)  # joints that stay do so where they were moved to
+            wanted = np.where(goals == starts, states[0], within)  # joints at rest keep their clipped values
             _check_end(name, states[-1], wanted, "goal", START_TOLERANCE if known is None else SAME_STATE)
     if known is not None:
         _check_limits(known, joint_names, path, motion)

@@ -1,19 +1,26 @@
-"""Polylines, and smooth curves along them that round their corners."""
+"""Polylines, smooth curves along them that round their corners, and the distance of a motion from a polyline."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.products import product
+from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.validation import number_array
 
 SAME_STATE = 1e-9  # distance below which states count as one [rad]
 SAME_DIRECTION = 1e-7  # norm of the difference of unit directions below which they count as one
+MAX_SAMPLES = 100_000
+AT_ONCE = 8_000  # samples between two calls of ``stop``
+SAMPLES_PER_DEVIATION = 10.0
+SPEED_MARGIN = 1.1  # largest ratio of the speed between knots to that at knots
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,3 +122,39 @@ class Curve:
         weights = np.hstack([(1 - u) ** 3, 3 * u**3 - 6 * u**2 + 4, 1 + 3 * u + 3 * u**2 - 3 * u**3, u**3]) / 6.0
         points: Array = np.einsum("nk,nkd->nd", weights, self.control[span[:, None] + np.arange(4)])
         return points
+
+
+def deviation_bound(
+    motion: Trajectory, line: Polyline, arc_at: tuple[Array, Array], window: float, deviation: float,
+    *, stop: Callable[[], bool] = lambda: False,
+) -> float:  # fmt: skip
+    """Return an upper bound on the Euclidean distance of a motion from a polyline [rad].
+
+    It is max_k d(q(t_k), line) + max_k |q(t_k+1) - q(t_k)| / 2 over samples t_k.
+
+    Args:
+        motion: The motion.
+        line: The polyline.
+        arc_at: Times from 0 to the end of the part that is compared, shape (K,) [s], and the arc lengths along the
+            polyline that the motion reaches at them, shape (K,) [rad]; linear in between.
+        window: Largest distance along the polyline from there to the nearest point [rad].
+        deviation: The allowed distance; samples are a tenth of it apart [rad].
+        stop: Called often; where it returns True, the bound is infinity.
+    """
+    end = float(arc_at[0][-1])
+    speed = float(np.linalg.norm(motion.velocities, axis=1).max()) * SPEED_MARGIN
+    count = min(MAX_SAMPLES, max(2, math.ceil(speed * end / (deviation / SAMPLES_PER_DEVIATION)) + 1))
+    times = np.linspace(0.0, end, count)
+    distance, step = 0.0, 0.0
+    for first in range(0, count - 1, AT_ONCE):
+        if stop():
+            return math.inf
+        some = times[first : first + AT_ONCE + 1]  # the last one is the first of the next
+        points = motion(some)
+        if len(line.states) == 1:
+            farthest = float(np.linalg.norm(points - line.states[0], axis=1).max())
+        else:
+            farthest = float(max_distance(points, np.interp(some, *arc_at), line.states, line.arc, window))
+        distance = max(distance, farthest)
+        step = max(step, float(np.linalg.norm(np.diff(points, axis=0), axis=1).max()))
+    return distance + step / 2.0

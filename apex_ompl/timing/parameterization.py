@@ -18,12 +18,9 @@ from apex_ompl.kernel.products import cholesky, solve
 from apex_ompl.paths.path import Path
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import ruckig_method, spline_method
-from apex_ompl.timing.curve import SAME_STATE, Polyline
-from apex_ompl.timing.deviation import deviation_bound
-from apex_ompl.timing.extremes import Extremes
-from apex_ompl.timing.moving_start import from_moving_start
-from apex_ompl.timing.ruckig_profiles import Profiles, joined
-from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.timing.curve import SAME_STATE, Polyline, deviation_bound
+from apex_ompl.timing.ruckig_method import Profiles, from_moving_start, joined
+from apex_ompl.timing.trajectory import Extremes, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_array, check_name, check_number, check_positive, check_states, finite_array
@@ -32,12 +29,12 @@ METHODS = MappingProxyType({"ruckig": ruckig_method.blended, "spline": spline_me
 """Methods by name.
 
 Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad] and a function that
-is asked whether to give up; it returns the trajectory and a bound on its distance from the polyline [rad], or None.
+returns True to end the search; it returns the trajectory and a bound on its distance from the polyline [rad], or None.
 """
 DEFAULT_METHOD = "ruckig"
 
-SHORTEST_DURATION = 1e-3  # of a motion between states that count as one [s]
-FALLBACK = "spline"  # where the method asked for has no blended motion
+SHORTEST_DURATION = 1e-3  # of a motion between states that count as the same [s]
+FALLBACK = "spline"  # where the given method has no blended motion
 BLENDS = 8  # deviations that are tried, each half of the one before, until the motion stops at corners
 LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rounding [rad]
 LIMITS = ("velocity", "acceleration", "jerk")
@@ -58,13 +55,13 @@ class Timing:
         acceleration_scale: Share of the acceleration limits.
         jerk_scale: Share of the jerk limits.
         deviation: Largest distance of the motion from the path, 0.001 to 10 [rad, Euclidean; synergies 0..1]; a motion
-            from a moving start may leave it by more, as little as can be.
+            from a moving start may leave the path by more where it must.
         minimum_duration: Least duration of the motion, up to 3600 [s].
-        max_velocity: Lower limits of velocity by joint name [rad/s]; the scale comes on top.
-        max_acceleration: Lower limits of acceleration, likewise [rad/s^2].
-        max_jerk: Lower limits of jerk, likewise [rad/s^3].
+        max_velocity: Reduced velocity limits by joint name [rad/s], to which the scale is applied too.
+        max_acceleration: Reduced acceleration limits by joint name [rad/s^2].
+        max_jerk: Reduced jerk limits by joint name [rad/s^3].
         start_velocity: Velocity at the start, one number a joint, or none for rest [rad/s].
-        start_acceleration: Acceleration at the start, likewise [rad/s^2].
+        start_acceleration: Acceleration at the start, one number a joint, or none for zero [rad/s^2].
     """
 
     method: str = DEFAULT_METHOD
@@ -107,7 +104,7 @@ class Timing:
             joint_names: Names of the joints in their order.
 
         Raises:
-            UnknownNameError: A joint has a limit and is none of these.
+            UnknownNameError: A limit is for an unknown joint.
             ParameterError: A limit is higher than the robot's, or one of the robot's is not positive.
         """
         if len(joint_names) != len(limits.velocity):
@@ -178,9 +175,9 @@ def time_path(
 
     A straight line is followed by a jerk-limited profile of Ruckig's (:mod:`apex_ompl.timing.ruckig_method`),
     which is the fastest. Any other path is followed by a blended motion of the method in ``timing``. Where ``fault``
-    rejects a motion, half its deviation is tried, several times, and at last a motion that stops at every corner. Where
-    Ruckig has no motion within the deviation and the position limits, which it does not know, the spline takes its
-    place.
+    rejects a motion, half its deviation is tried, several times, and last a motion that stops at every corner. Where
+    Ruckig has no motion within the deviation and the position limits, which it does not take into account, the spline
+    method is used.
 
     Args:
         path: Path, or states of shape (N, dof). The motion follows the straight lines between its states, also where
@@ -188,11 +185,11 @@ def time_path(
         limits: Limits of the joints.
         joint_names: Names of the joints, in the order of the columns.
         timing: How the path is timed.
-        fault: Returns why a motion is invalid, empty for a valid one.
-        stop: Asked often whether to give up.
+        fault: Returns the reason for which a motion is invalid, or an empty text.
+        stop: Called often; True ends the search.
 
     Raises:
-        TimingStoppedError: It was told to stop before it had a valid motion.
+        TimingStoppedError: ``stop`` returned True before there was a valid motion.
         TimingError: No valid motion was found; the message is the fault of the last one that was tried.
         ParameterError: The path has another shape, a number that is not finite, or a position outside the limits; the
             names are not those of the joints; or an option is out of its range.
@@ -265,7 +262,7 @@ def _from_moving_start(
     start: tuple[Array, Array], timed: TimedPath, line: Polyline, limits: Limits, timing: Timing,
     *, stop: Callable[[], bool],
 ) -> list[TimedPath]:  # fmt: skip
-    """Return motions from a moving start: those that keep the deviation, fastest first, then the others, nearest first.
+    """Return motions from a moving start: those within the deviation, fastest first, then the others, nearest first.
 
     Args:
         start: Velocity and acceleration at the start, each of shape (dof,).
@@ -273,7 +270,7 @@ def _from_moving_start(
         line: The path.
         limits: The scaled limits.
         timing: How the path is timed.
-        stop: Asked often whether to look for no more.
+        stop: Called often; True ends the search.
     """
     candidates = []
     for motion, join_time in from_moving_start(*start, timed.trajectory, limits, timing.minimum_duration):
@@ -293,7 +290,7 @@ def _at_rest(states: Array, joint_names: tuple[str, ...]) -> Trajectory:
 
 
 def _lasting(motion: Trajectory, duration: float) -> Trajectory:
-    """Return a motion slowed down to a duration [s] if it is shorter; one at rest stays at rest so long."""
+    """Return a motion slowed down to a duration [s] if it is shorter; a motion at rest is prolonged."""
     if motion.duration >= duration:
         return motion
     if motion.duration > SHORTEST_DURATION:
@@ -314,4 +311,4 @@ def warm_up() -> None:
     Trajectory(*motion.knots, ("joint",)).states(motion.times)
     Extremes.of(*motion.knots)
     cubic_rates(*motion.knots, np.empty((len(motion.times), 2)))
-    solve(cholesky(np.eye(1)), np.ones((1, 1)))  # which curves through paths need
+    solve(cholesky(np.eye(1)), np.ones((1, 1)))  # for spline fits

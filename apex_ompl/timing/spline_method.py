@@ -12,8 +12,7 @@ import numpy as np
 from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing.curve import Curve, Polyline
-from apex_ompl.timing.deviation import deviation_bound
+from apex_ompl.timing.curve import Curve, Polyline, deviation_bound
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -33,7 +32,7 @@ class Blend(NamedTuple):
         trajectory: The motion.
         deviation: A bound on its distance from the polyline [rad].
         arc_at: Times of its knots, shape (K,) [s], and the arc lengths along the polyline that it reaches at them,
-            shape (K,) [rad]; for :func:`apex_ompl.timing.deviation.deviation_bound`.
+            shape (K,) [rad]; for :func:`apex_ompl.timing.curve.deviation_bound`.
         window: Largest distance along the polyline from there to the nearest point [rad].
     """
 
@@ -63,7 +62,7 @@ def blend(
        (:mod:`apex_ompl.kernel.compiled.time_parameterization`; Pham and Pham 2018).
     3. States at times h apart on that motion are the control points of a uniform cubic B-spline in time. Averages of
        states within the limits are within the limits, and the jerk is at most 2 a_max / h. In step 2 the limit of
-       acceleration is min(a_max, j_max h); what is still over a limit is removed by stretching h.
+       acceleration is min(a_max, j_max h); h is stretched where a limit is still exceeded.
     4. The h with the shortest motion is chosen, or the next smaller one that keeps the deviation.
 
     Args:
@@ -71,10 +70,10 @@ def blend(
         limits: Limits of the joints.
         joint_names: Names of the joints, in the order of the columns.
         deviation: Largest distance of the motion from the polyline [rad].
-        stop: Asked before every knot spacing whether to give up.
+        stop: Called before every knot spacing; True ends the search.
 
     Returns:
-        The motion, or None where none keeps ``deviation``, or when told to stop meanwhile.
+        The motion, or None where none keeps ``deviation``, or when ``stop`` returned True.
     """
     if line.length > MAX_SPANS * CONTROL_POINT_SPACING * deviation:
         return None
@@ -148,8 +147,9 @@ def spline_in_time(
 ) -> Trajectory:
     """Return the uniform cubic B-spline in time with control points of shape (K + 2, dof) and a knot spacing [s].
 
-    It ends at rest in the last control point, three times given; and begins so, or at ``start``: position, velocity and
-    acceleration, of which the first three control points are made (:func:`start_points`). Both are exact.
+    It ends at rest in the last control point, which is given three times. It starts at rest in the same way, or with
+    the position, velocity and acceleration of ``start``, which determine the first three control points
+    (:func:`start_points`). Both ends are exact.
     """
     before, at, after = control[:-2], control[1:-1], control[2:]
     positions = (before + 4.0 * at + after) / 6.0
@@ -162,9 +162,9 @@ def spline_in_time(
 
 
 def start_points(start: tuple[Array, Array, Array], spacing: float) -> Array:
-    """Return the first three control points of a uniform cubic B-spline in time that begins in a given way.
+    """Return the first three control points of a uniform cubic B-spline in time with a given start.
 
-    With (c_0 + 4 c_1 + c_2) / 6 = q, (c_2 - c_0) / 2h = v and (c_0 - 2 c_1 + c_2) / h^2 = a.
+    They solve (c_0 + 4 c_1 + c_2) / 6 = q, (c_2 - c_0) / 2h = v and (c_0 - 2 c_1 + c_2) / h^2 = a.
 
     Args:
         start: Position q, velocity v and acceleration a, each of shape (dof,).

@@ -7,30 +7,61 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.kernel.compiled.cubic_pieces import relative_gap, sample_motion
+from apex_ompl.kernel.compiled.cubic_pieces import motion_extremes, relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing.extremes import Extremes
 from apex_ompl.timing.files import STATES, SUFFIXES, decode, encode
 from apex_ompl.timing.smoothness import spectral_arc_length
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import counted, fields_line, html_table, one_line
 from apex_ompl.util.files import path_text, suffix_of, write_atomically
 from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
 
-ROUNDING = 1e-9  # of shares of limits
+ROUNDING = 1e-9  # of the used share of a limit
 CONTINUITY_TOLERANCE = 1e-6  # relative error of a knot integrated from the one before; files of ROS round times
 MAX_SAMPLES = 10**7
 BLOCK = 1000  # samples of a stream that are computed at once
-SPEED_SPACING, MAX_SPEED_SAMPLES = (
-    0.001,
-    2**15,
-)  # of the speed profile for the spectral arc length [s], and their number
+SPEED_SPACING, MAX_SPEED_SAMPLES = 0.001, 2**15  # of the speed profile for the spectral arc length [s]
+AT_REST = 1e-6
+"""Largest velocity of a joint at rest [rad/s]."""
+
+
+class Extremes(NamedTuple):
+    """Least and largest positions, largest velocities, accelerations and jerks of a motion, each of shape (dof,).
+
+    Jerks are lower bounds within the rounding of the knots. Knots of different joints may be 1e-10 s apart, and there
+    the rounding of times and accelerations alone changes a jerk by 1e-6 of it and more.
+    """
+
+    low: Array
+    high: Array
+    velocity: Array
+    acceleration: Array
+    jerk: Array
+
+    @classmethod
+    def of(cls, times: Array, positions: Array, velocities: Array, accelerations: Array) -> Self:
+        """Return the extremes of a motion: :mod:`apex_ompl.kernel.compiled.cubic_pieces`.
+
+        Args:
+            times: Times of the knots, shape (K,) [s].
+            positions: At the knots, shape (K, dof).
+            velocities: At the knots, shape (K, dof).
+            accelerations: At the knots, shape (K, dof).
+        """
+        found = np.empty((len(cls._fields), positions.shape[1]))
+        motion_extremes(times, positions, velocities, accelerations, found)
+        return cls(*found)
+
+    def slower(self, factor: float) -> Self:
+        """Return the extremes of the same motion in a time that is ``factor`` times as long."""
+        rest = self.velocity / factor, self.acceleration / factor**2, self.jerk / factor**3
+        return type(self)(self.low, self.high, *rest)
 
 
 class Sample(NamedTuple):
@@ -103,7 +134,7 @@ class Trajectory:
 
     @classmethod
     def unchecked(cls, times: Array, states: Array, joint_names: tuple[str, ...]) -> Trajectory:
-        """Return the motion through knots that compiled code has made, states of shape (3, K, dof): 1 us, not 75."""
+        """Return the motion through knots from compiled code, states of shape (3, K, dof), without checks."""
         motion = object.__new__(cls)
         values = times, *states, joint_names
         for name, value in zip(("times", *STATES, "joint_names"), values, strict=True):
@@ -150,7 +181,7 @@ class Trajectory:
         return html_table(f"Motion of {self.duration:.3f} s, {counted(self.dof, 'joint')}", rows, head)
 
     def __call__(self, time: ArrayLike, order: int = 0) -> Array:
-        """Return positions or their derivatives; before 0 and after the end the robot stands still.
+        """Return positions or their derivatives; before 0 and after the end the robot is at rest.
 
         Args:
             time: One time, or several of shape (N,) [s].
@@ -160,7 +191,7 @@ class Trajectory:
             Shape (dof,), or (N, dof).
 
         Raises:
-            ParameterError: ``order`` is none of these, or a time is not a finite number.
+            ParameterError: ``order`` is not 0 to 3, or a time is not a finite number.
         """
         check_integer(order, "order", 0, len(STATES))
         given = finite_array(time, "time")
@@ -318,3 +349,38 @@ def concatenate(parts: Sequence[Trajectory]) -> Trajectory:
     times = [part.times[(k > 0) :] + end for k, (part, end) in enumerate(zip(parts, ends[:-1], strict=True))]
     states = [np.concatenate([getattr(part, name)[(k > 0) :] for k, part in enumerate(parts)]) for name in STATES]
     return Trajectory(np.concatenate(times), states[0], states[1], states[2], parts[0].joint_names)
+
+
+def is_at_rest(motion: Trajectory, time: float) -> bool:
+    """Whether no joint is faster than ``AT_REST`` at a time [s]; before 0 and after the end the robot is at rest."""
+    return bool((np.abs(motion(time, 1)) <= AT_REST).all())
+
+
+def rests(motion: Trajectory) -> Array:
+    """Return the intervals of time in which a motion is at rest, shape (N, 2) [s].
+
+    In each, no joint is ever faster than ``AT_REST``. A moment of rest between two moving pieces is an interval
+    of length zero. Starts and ends of intervals are knots.
+    """
+    slow = np.all(np.abs(motion.velocities) <= AT_REST, axis=1).tolist()
+    resting = _is_resting(motion)
+    found, k, last = list[tuple[int, int]](), 0, len(slow) - 1
+    while k <= last:
+        if slow[k]:
+            end = k
+            while end < last and resting[end]:
+                end += 1
+            found.append((k, end))
+            k = end
+        k += 1
+    return np.asarray(motion.times[np.array(found, int).reshape(-1, 2)])
+
+
+def _is_resting(motion: Trajectory) -> Flags:
+    """Return whether each piece between knots is at rest, shape (K - 1,)."""
+    v, a, j, t = motion.velocities, motion.accelerations[:-1], motion.jerks, np.diff(motion.times)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        turn = np.clip(np.nan_to_num(-a / j), 0.0, t)  # where the velocity is extreme
+    inner = np.abs(v[:-1] + turn * (a + turn * j / 2.0))
+    fastest = np.maximum(np.maximum(np.abs(v[:-1]), np.abs(v[1:])), inner)
+    return np.asarray((fastest <= AT_REST).all(axis=1))

@@ -26,7 +26,7 @@ Positive = Annotated[float, Field(gt=0.0)]
 
 
 class MirrorConfig(StrictModel):
-    """Mirror symmetry of a robot, see ``apex_ompl.training.mirror.Mirror``; one number for each joint."""
+    """Mirror symmetry of a robot, see ``apex_ompl.training.data.Mirror``; one number for each joint."""
 
     order: tuple[Annotated[int, Field(ge=0)], ...]
     sign: tuple[Literal[-1, 1], ...]
@@ -62,7 +62,7 @@ class TrainingConfig(StrictModel):
         data: Folder of a data set, or a file of paths; or several.
         robot: File of the robot's kernel tables.
         cases: Folder of validation problems, as ``generate_data.py --write-cases`` writes them; none by default.
-        initial: Checkpoint whose weights the training begins with, by name or folder; its latent space and key states
+        initial: Checkpoint whose weights the training starts with, by name or folder; its latent space and key states
             are kept. Random weights by default.
         latent: Latent space.
         condition: Encoder of conditions.
@@ -82,10 +82,10 @@ class TrainingConfig(StrictModel):
             counts, 1 where none does.
         mirror: Mirror symmetry of the robot, by which the data are augmented.
         parts: Share of the paths of which a part is taken, for a scene ``clearances``, as ``mixed`` is, see
-            :class:`apex_ompl.training.scene_data.Augmentation`.
+            :class:`apex_ompl.training.conditions.Augmentation`.
         mixed: Share of the paths among whose obstacles are put some of another scene that leave it free.
-        collision: What collisions of the denoiser's estimates weigh in the loss, for a scene ``clearances``, see
-            :meth:`~apex_ompl.training.torch_scene_encoding.TorchSight.collision_cost`; not in validation losses.
+        collision: Weight of the collision cost of the denoiser's estimates in the loss, for a scene ``clearances``, see
+            :meth:`~apex_ompl.training.scene_encoding.TorchSceneEncoding.collision_cost`; not in validation losses.
         held_out: Share of the problems kept for the validation loss.
         units: Number of units of a data set in memory at the same time; all by default.
         log_every: Steps between two lines of the log.

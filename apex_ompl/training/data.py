@@ -5,6 +5,7 @@ from __future__ import annotations
 import fnmatch
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,27 +18,70 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.config import key_shapes
 from apex_ompl.model.query import Probes
-from apex_ompl.model.scene_encoding import KeyStates, Sight, key_states
-from apex_ompl.training.conditions import Conditions, ConditionTable
+from apex_ompl.model.scene_encoding import KeyStates, SceneEncoding, key_states
+from apex_ompl.training.conditions import Augmentation, Conditions, ConditionTable, EncodedPaths
 from apex_ompl.training.config import TrainingConfig
-from apex_ompl.training.cost_gradient import with_slopes
-from apex_ompl.training.kernel_scene_encoding import CompiledSight
-from apex_ompl.training.mirror import Mirror
-from apex_ompl.training.records import SPLINE, Paths
-from apex_ompl.training.scene_data import Augmentation, SightTable
+from apex_ompl.training.records import SPLINE, Paths, to_half, to_micro
+from apex_ompl.training.scene_encoding import KernelSceneEncoding, TorchSceneEncoding
 from apex_ompl.training.store import Store, load
-from apex_ompl.training.torch_model import load_torch_model
-from apex_ompl.training.torch_scene_encoding import TorchSight
+from apex_ompl.training.torch_model import load_torch_model, with_slopes
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file
 
+EMPTY_HANDS = "[]"  # JSON of the held objects
+STRIDE, SELF_CLEARANCE_RANGE = 8, 0.01  # of the states of an image that are checked; range of the check [m]
 KEY_PATHS = 5_000  # paths of whose states key states are chosen
 STATISTICS_PATHS = 100_000  # most paths from which the statistics of the latent space are computed
 VALIDATION_SHARE = 0.02  # most of all problems on which the validation loss is taken
 CPU = torch.device("cpu")
-MARGIN = 0.02  # distance at which collisions begin to cost [m]
-COSTLY = 2  # of so many paths in a batch, the collisions of one are looked for
+MARGIN = 0.02  # distance from which the collision cost is positive [m]
+COSTLY = 2  # one of so many paths in a batch has its collision cost computed
 PASSES, UNLIMITED = 4, 2**40  # passes over a shard before the next; steps where there is only one shard
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Mirror symmetry of a robot in the plane y = 0.
+
+    The image of state q is ``sign * q[order] + shift``.
+
+    Attributes:
+        order: Index of the joint whose value each joint takes.
+        sign: 1 or -1 for each joint.
+        shift: Offset of each joint [rad].
+    """
+
+    order: Sequence[int]
+    sign: Sequence[float]
+    shift: Sequence[float]
+
+    def states(self, q: Array) -> Array:
+        """Return the images of states, shape (..., dof)."""
+        return np.asarray(q[..., list(self.order)] * np.array(self.sign) + np.array(self.shift))
+
+    def paths(self, paths: Paths, kernel: Kernel) -> Paths:
+        """Return the images of all paths of problems with empty hands.
+
+        No robot is exactly symmetric: images that leave the joint limits, or in which the robot's sphere cover
+        collides with itself, are left out.
+        """
+        a = dict(paths.arrays)
+        spline, lower, upper = paths.spline, kernel.robot.arrays.lower, kernel.robot.arrays.upper
+        control = self.states(paths.control())
+        inside = ((control >= lower) & (control <= upper)).all(axis=(1, 2))
+        held = np.array(paths.names["held"], object)[a["held"][a["problem"]]] if len(control) else np.zeros(0, object)
+        kept = inside & (held == EMPTY_HANDS)
+        for k in np.flatnonzero(kept):
+            kept[k] = kernel.clearance(spline.path(control[k])[::STRIDE], SELF_CLEARANCE_RANGE)[:, 1].min() >= 0.0
+        flip = np.array([1.0, -1.0, 1.0])
+        a["position"] = (a["position"] * flip).astype(np.float32)
+        a["orientation"] = (a["orientation"] * np.array([-1.0, 1.0, -1.0, 1.0])).astype(np.float32)
+        for name in ("problem", "clearance", "length", "source", "homotopy"):
+            a[name] = a[name][kept]
+        a["point"] = (a["point"][kept] * flip).astype(np.float32)
+        a["start"], a["goal"] = to_micro(control[kept, 0]), to_micro(control[kept, -1])
+        a["control"] = to_half(control[kept][:, spline.inner], lower, upper).astype(np.float16)
+        return Paths(a, paths.names, paths.about)
 
 
 def is_held_out(name: str, share: float) -> bool:
@@ -54,14 +98,14 @@ class Shard:
     """
 
     def __init__(
-        self, sets: Sequence[Paths], eyes: Probes | TorchSight, kernel: Kernel, weights: Mapping[str, float],
-        augmentation: Augmentation | None = None,
+        self, sets: Sequence[Paths], encoding: Probes | TorchSceneEncoding, kernel: Kernel,
+        weights: Mapping[str, float], augmentation: Augmentation | None = None,
     ) -> None:  # fmt: skip
         """Compute the tensors of paths.
 
         Args:
             sets: The paths.
-            eyes: Probe points of the robot, or what a model of scene ``clearances`` sees.
+            encoding: Probe points of the robot, or the features of a scene ``clearances``.
             kernel: The robot.
             weights: Sampling weight of each path, by patterns of ``suite/level``; the first that matches counts.
             augmentation: How paths are varied, for a scene ``clearances``; not at all by default.
@@ -74,12 +118,12 @@ class Shard:
         self.cumulated = np.cumsum(np.concatenate(found or [np.zeros(0)]))
         if not len(self.cumulated) or not self.cumulated[-1] > 0.0:
             raise ParameterError("training data", len(self.cumulated), "paths, some of them with a positive weight")
-        self._tables: list[ConditionTable | SightTable]
-        if isinstance(eyes, TorchSight):
-            self._tables = [SightTable(Paths.concatenate(sets), eyes, augmentation)]
+        self._tables: list[ConditionTable | EncodedPaths]
+        if isinstance(encoding, TorchSceneEncoding):
+            self._tables = [EncodedPaths(Paths.concatenate(sets), encoding, augmentation)]
             self._ends = np.array([len(self.cumulated)])
             return
-        self._tables = [ConditionTable(paths, eyes, kernel) for paths in sets]
+        self._tables = [ConditionTable(paths, encoding, kernel) for paths in sets]
         self._ends = np.cumsum([len(paths) for paths in sets])
 
     def __len__(self) -> int:
@@ -170,7 +214,7 @@ class TrainingData:
         validation: Paths of held-out problems, the same during the whole run, or None.
         spline: Fields of the paths' spline.
         probes: Probe points of the robot.
-        sight: What a model of scene ``clearances`` sees, None for others.
+        scene_encoding: Features of a scene ``clearances``; None for other scenes.
         number: Index of the shard.
         left: Number of steps before the next shard.
     """
@@ -189,8 +233,8 @@ class TrainingData:
                 raise ParameterError("mirror", len(config.mirror.order), f"{robot.dof} joints")
             self._mirror = Mirror(**config.mirror.model_dump())
         self.validation: Shard | None = None
-        self.sight: Sight | None = None
-        self._eyes: TorchSight | None = None
+        self.scene_encoding: SceneEncoding | None = None
+        self._batch_encoding: TorchSceneEncoding | None = None
         self.number = self.left = 0
         self.shard = self._read(0)
         self._reset_steps()
@@ -230,21 +274,21 @@ class TrainingData:
             raise ParameterError("data", paths.about["robot"], f"paths of {robot.name}, whose tables are given")
         self.spline = {k: paths.about[k] for k in SPLINE}
         train, _ = split(paths, config.held_out)
-        if self.sight is None and config.condition.scene == "clearances":
-            self.sight = Sight(self._key_states(train), self.probes, config.condition.hands)
-            kind = CompiledSight if self._device.type == "cpu" else TorchSight
-            self._eyes = kind(self.sight, self._kernel, self._device)
+        if self.scene_encoding is None and config.condition.scene == "clearances":
+            self.scene_encoding = SceneEncoding(self._key_states(train), self.probes, config.condition.hands)
+            kind = KernelSceneEncoding if self._device.type == "cpu" else TorchSceneEncoding
+            self._batch_encoding = kind(self.scene_encoding, self._kernel, self._device)
             self._spline = train.spline
-            self._looked_at = self._eyes.tensor(self._spline.basis(self.probes.shares))
-        eyes = self._eyes or self.probes
+            self._along_basis = self._batch_encoding.tensor(self._spline.basis(self.probes.shares))
+        encoding = self._batch_encoding or self.probes
         if self.validation is None:
             few = split(paths, min(config.held_out, VALIDATION_SHARE))[1]  # the same problems for every larger share
-            self.validation = Shard([few], eyes, self._kernel, {}) if len(few) else None
+            self.validation = Shard([few], encoding, self._kernel, {}) if len(few) else None
         sets = [train] if self._mirror is None else [train, self._mirror.paths(train, self._kernel)]
-        return Shard(sets, eyes, self._kernel, config.weights, Augmentation(config.parts, config.mixed))
+        return Shard(sets, encoding, self._kernel, config.weights, Augmentation(config.parts, config.mixed))
 
     def _key_states(self, train: Paths) -> KeyStates:
-        """Return states of paths, spread out, or those of the checkpoint that the run begins with."""
+        """Return states of paths that are far apart, or the key states of the checkpoint that the run starts with."""
         config, robot = self._config, self._kernel.robot
         if config.initial is not None:
             network = load_torch_model(config.initial, robot=robot.name).network
@@ -254,26 +298,26 @@ class TrainingData:
         control = train.control(np.sort(rng.integers(len(train), size=min(KEY_PATHS, len(train)))))
         return key_states(robot, train.spline.path(control).reshape(-1, robot.dof), config.condition.keys, rng)
 
-    def look(self, control: Tensor, conditions: Conditions) -> Tensor:
-        """Return what a model of scene ``clearances`` sees along paths, control points (B, points, dof): (B, F)."""
-        assert self._eyes is not None
+    def features_along(self, control: Tensor, conditions: Conditions) -> Tensor:
+        """Return features of a scene ``clearances`` along paths of control points (B, points, dof): shape (B, F)."""
+        assert self._batch_encoding is not None
         assert conditions.among is not None
-        return self._eyes.along(self._looked_at @ control, conditions.among)
+        return self._batch_encoding.along(self._along_basis @ control, conditions.among)
 
-    def collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
-        """Return the mean of what the collisions of some of the paths cost, see :meth:`TorchSight.collision_cost` [m].
+    def collision_cost(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
+        """Return the mean :meth:`TorchSceneEncoding.collision_cost` of some of the paths [m].
 
         Args:
             control: Control points, shape (B, points, dof) [rad].
             conditions: Conditions of the paths.
-            places: Where in each of L equal pieces of a path its state is looked at, shape (L,) in 0..1.
+            places: Where in each of L equal pieces of a path its state is sampled, shape (L,) in 0..1.
         """
-        assert self._eyes is not None
+        assert self._batch_encoding is not None
         assert conditions.among is not None
         mine = (conditions.among.owner % COSTLY == 0).nonzero()[:, 0]
         among = conditions.among.chosen(mine, conditions.among.owner[mine] // COSTLY)
         shares = (np.arange(len(places)) + places.cpu().numpy()) / len(places)
-        paths = self._eyes.tensor(self._spline.basis(shares)) @ control[::COSTLY]
+        paths = self._batch_encoding.tensor(self._spline.basis(shares)) @ control[::COSTLY]
         with torch.no_grad():
-            cost, slopes = self._eyes.collision_cost(paths, among, MARGIN)
+            cost, slopes = self._batch_encoding.collision_cost(paths, among, MARGIN)
         return with_slopes(paths, cost, slopes).mean()

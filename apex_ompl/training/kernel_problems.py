@@ -1,8 +1,8 @@
 """Problems as tables of the kernel, to be solved on machines without Pinocchio, Coal and OMPL.
 
-They are written on a machine that has those (:mod:`apex_ompl.training.problem_records`), and solved from the straight
-line and from random bumps; paths that the sphere cover proves free are kept. Parts of paths are left out: the
-obstacle point at their start needs Coal.
+They are written on a machine that has those (:mod:`apex_ompl.training.units`). The data engine solves them from the
+straight line and its random perturbations, and keeps the paths that the sphere cover proves free. Parts of paths are
+left out: the obstacle point at their start needs Coal.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ from apex_ompl.kernel.table_checks import scene_fault
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.geometry import SHAPES, ObstacleRecord
 from apex_ompl.paths.spline import Spline
-from apex_ompl.training.engine import STRATEGIES, Engine, EngineOptions, ProblemRecord
-from apex_ompl.training.path_finder import PathFinder
+from apex_ompl.training.engine import STRATEGIES, Engine, EngineOptions, PathFinder, ProblemRecord
 from apex_ompl.training.records import Paths
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file, make_folder, write_atomically

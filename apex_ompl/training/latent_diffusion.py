@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from apex_ompl.model.config import ModelConfig, key_shapes
-from apex_ompl.model.schedule import NoiseSchedule
+from apex_ompl.model.diffusion import NoiseSchedule
 from apex_ompl.paths.spline import Spline
 from apex_ompl.training.autoencoder import Autoencoder, LinearLatent, VariationalLatent
 from apex_ompl.training.conditions import Conditions
-from apex_ompl.training.denoisers import MLPDenoiser, UNetDenoiser
-from apex_ompl.training.encoders import ConditionEncoder
+from apex_ompl.training.networks import ConditionEncoder, MLPDenoiser, UNetDenoiser
 
-COST_STATES = 8  # states of a path at which collisions are looked for
-Look = Callable[[Tensor, Conditions], Tensor]
-"""Returns what a model sees along paths, control points of shape (B, points, dof) [rad], features of shape (B, F)."""
+COST_STATES = 8  # states of a path at which its collision cost is computed
+FeaturesAlong = Callable[[Tensor, Conditions], Tensor]
+"""Returns features, shape (B, F), along paths of control points, shape (B, points, dof) [rad]."""
 
-Collide = Callable[[Tensor, Conditions, Tensor], Tensor]
-"""Returns what collisions of paths cost, control points of shape (B, points, dof) [rad], at some places along them."""
+CollisionCost = Callable[[Tensor, Conditions, Tensor], Tensor]
+"""Returns the collision cost of paths of control points, shape (B, points, dof) [rad], at some places along them."""
 
 
 class Draws(NamedTuple):
@@ -31,12 +32,49 @@ class Draws(NamedTuple):
     Attributes:
         noise: Standard normal epsilon, shape (B, *latent).
         t: Diffusion steps, shape (B,).
-        places: Where in each of L equal pieces of a path collisions are looked for, shape (L,) in 0..1.
+        places: Where in each of L equal pieces of a path its collision cost is computed, shape (L,) in 0..1.
     """
 
     noise: Tensor
     t: Tensor
     places: Tensor
+
+
+@dataclass(frozen=True)
+class TrainingSchedule(NoiseSchedule):
+    """Noise schedule for batches in which each sample has a step of its own."""
+
+    _known: dict[torch.device, Tensor] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def scales(self, t: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return sqrt(abar_t) and sqrt(1 - abar_t) at steps (B,), in a shape that multiplies tensors like ``like``."""
+        if like.device not in self._known:
+            known = np.sqrt(np.stack([self.alpha_bar, 1.0 - self.alpha_bar]))
+            self._known[like.device] = like.double().new_tensor(known)
+        signal, sigma = (
+            self._known[like.device][:, t.to(like.device)]
+            .to(like.dtype)
+            .reshape(2, *t.shape, *[1] * (like.ndim - t.ndim))
+        )
+        return signal, sigma
+
+    def noisy(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Return noisy samples sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon (equation 2) at steps (B,)."""
+        signal, sigma = self.scales(t, clean)
+        return signal * clean + sigma * noise
+
+    def target(self, prediction: str, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Return the quantity that a network learns to predict from noisy samples; :meth:`estimate` is its inverse.
+
+        ``noise`` is epsilon (equation 5), ``clean`` is z_0, and ``velocity`` is v = sqrt(abar_t) epsilon -
+        sqrt(1 - abar_t) z_0 (Salimans and Ho 2022).
+        """
+        if prediction == "noise":
+            return noise
+        if prediction == "clean":
+            return clean
+        signal, sigma = self.scales(t, clean)
+        return signal * noise - sigma * clean
 
 
 class LatentDiffusion(nn.Module):
@@ -73,7 +111,7 @@ class LatentDiffusion(nn.Module):
             self.autoencoder = VariationalLatent(spline, dof, latent.channels, latent.width, latent.halvings)
         self.encoder = ConditionEncoder(
             dof, out=condition.out, width=condition.width, scene=condition.scene, point=condition.point,
-            probes=config.probes, along=condition.along, seen=config.seen,
+            probes=config.probes, along=condition.along, scene_features=config.scene_features,
             refined=config.along_size if condition.refined else 0,
         )  # fmt: skip
         latent_shape, net = self.autoencoder.latent, config.denoiser
@@ -82,7 +120,7 @@ class LatentDiffusion(nn.Module):
             self.denoiser: nn.Module = UNetDenoiser(channels, condition.out, net.width, net.multipliers)
         else:
             self.denoiser = MLPDenoiser(math.prod(latent_shape), condition.out, net.width, net.blocks)
-        self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
+        self.schedule = TrainingSchedule(config.noise.steps, config.noise.schedule)
         self.register_buffer("probe_joint", torch.zeros(config.probes, dtype=torch.int64))
         self.register_buffer("probe_offset", torch.zeros(config.probes, 3))
         for name, shape in key_shapes(config).items():
@@ -123,22 +161,22 @@ class LatentDiffusion(nn.Module):
         return Draws(noise, t, torch.rand(COST_STATES, generator=generator))
 
     def loss(
-        self, clean: Tensor, draws: Draws, conditions: Conditions, look: Look | None = None,
-        collide: Collide | None = None,
+        self, clean: Tensor, draws: Draws, conditions: Conditions, features_along: FeaturesAlong | None = None,
+        collision_cost: CollisionCost | None = None,
     ) -> Tensor:  # fmt: skip
         """Return the mean square error of the denoiser (equation 5 of the paper).
 
         loss = mean((f(sqrt(abar_t) z_0 + sqrt(1 - abar_t) epsilon, t, g) - target)^2), where the target is epsilon,
-        the velocity or z_0, see :meth:`NoiseSchedule.target`. A denoiser that sees its own last estimate is evaluated
-        at a noisier step first, without one; the loss is the mean of both. What the collisions of the denoiser's last
-        estimate of z_0 cost may be added, after PRESTO (arXiv 2409.16012).
+        the velocity or z_0, see :meth:`TrainingSchedule.target`. A denoiser that sees its own last estimate is
+        evaluated at a noisier step first, without one; the loss is the mean of both. The collision cost of the
+        denoiser's last estimate of z_0 may be added, after PRESTO (arXiv 2409.16012).
 
         Args:
             clean: Latent vectors z_0 of data, shape (B, *latent).
             draws: Noise epsilon and steps t.
             conditions: Conditions g.
-            look: Where the denoiser sees its own estimate, returns the features along paths.
-            collide: Returns what the collisions of paths cost.
+            features_along: Where the denoiser sees its own estimate, returns the features along paths.
+            collision_cost: Returns the collision cost of paths.
         """
         noise, t, places = draws
         encoded = self.encoder(conditions)
@@ -146,17 +184,17 @@ class LatentDiffusion(nn.Module):
             return nn.functional.mse_loss(self.denoise(torch.zeros_like(clean), torch.zeros_like(t), encoded), clean)
         first, single = None, torch.autocast(clean.device.type, enabled=False)  # for paths, half precision is coarse
         if self.config.condition.refined:
-            assert look is not None
+            assert features_along is not None
             first, estimate = self._error(clean, noise, torch.maximum(t, t.roll(1)), encoded)
             with torch.no_grad(), single:
-                along = look(self._decoded(estimate, conditions), conditions)
+                along = features_along(self._decoded(estimate, conditions), conditions)
             encoded = self.encoder.refine(encoded, along)
         error, estimate = self._error(clean, noise, t, encoded)
         error = error if first is None else 0.5 * (first + error)
-        if collide is None:
+        if collision_cost is None:
             return error
         with single:
-            return error + collide(self._decoded(estimate, conditions), conditions, places)
+            return error + collision_cost(self._decoded(estimate, conditions), conditions, places)
 
     def _decoded(self, latent: Tensor, conditions: Conditions) -> Tensor:
         """Return the control points of latent vectors, inside the limits."""
@@ -166,7 +204,7 @@ class LatentDiffusion(nn.Module):
     def _error(self, clean: Tensor, noise: Tensor, t: Tensor, encoded: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean square error of the denoiser at steps t, and its estimate of the latent vectors."""
         prediction = self.config.noise.prediction
-        sample = self.schedule.add_noise(clean, noise, t)
+        sample = self.schedule.noisy(clean, noise, t)
         output = self.denoise(sample, t, encoded).float()
         error = nn.functional.mse_loss(output, self.schedule.target(prediction, clean, noise, t))
         signal, sigma = self.schedule.scales(t, clean)

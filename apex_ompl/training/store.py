@@ -114,7 +114,7 @@ class Store:
         """Write a unit.
 
         Raises:
-            DatasetError: It cannot be written, for want of space for example; nothing is left of it.
+            DatasetError: It cannot be written, for example on a full disk; no part of it remains.
         """
         save(self.folder / "units" / f"{name}.zip", paths)
 
@@ -144,7 +144,7 @@ def save(path: str | os.PathLike[str], paths: Paths) -> None:
     try:
         handle, temporary = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=".part", dir=path.parent)
         os.close(handle)
-        os.unlink(temporary)  # the store wants to make it
+        os.unlink(temporary)  # the store creates it
         with zip_store(temporary, mode="w") as store:
             head = {
                 "schema": SCHEMA,

@@ -1,31 +1,76 @@
-"""A trained model evaluated by torch: any architecture, on any device."""
+"""Trained models evaluated by torch: any architecture, on any device; their checkpoints are read and written here."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
-from collections.abc import Mapping, Sequence
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors.numpy import save as save_arrays
 from torch import Tensor
 
-from apex_ompl.errors import ParameterError
+from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.model.checkpoint import CheckpointConfig, check_shapes, read_checkpoint
-from apex_ompl.model.config import key_shapes
-from apex_ompl.model.guidance import Guidance
+from apex_ompl.model.array_model import expanded, quantized
+from apex_ompl.model.checkpoint import CONFIG, SCHEMA, WEIGHTS, CheckpointConfig, check_shapes, read_checkpoint
+from apex_ompl.model.config import ModelConfig, key_shapes
+from apex_ompl.model.guidance import Guidance, collision_cost
 from apex_ompl.model.proposals import TrajectoryModel
-from apex_ompl.model.quantization import expanded
 from apex_ompl.model.query import Probes, Query
+from apex_ompl.training.autoencoder import Autoencoder
 from apex_ompl.training.conditions import batch_queries
-from apex_ompl.training.cost_gradient import gradient, log_likelihood
 from apex_ompl.training.latent_diffusion import LatentDiffusion
 from apex_ompl.types import Array
+from apex_ompl.util.files import is_file
 from apex_ompl.util.threads import one_torch_thread
+
+CARD = "README.md"
+PART = ".part"
+
+
+def with_slopes(paths: Tensor, cost: Tensor, slopes: Tensor) -> Tensor:
+    """Return costs of paths that were computed outside of torch as functions of the paths, with known gradients.
+
+    Args:
+        paths: Shape (B, N, dof) [rad].
+        cost: Shape (B,).
+        slopes: Gradients of the costs, shape (B, N, dof).
+    """
+    return cost + (slopes * (paths - paths.detach())).sum(dim=(1, 2))
+
+
+def log_likelihood(
+    autoencoder: Autoencoder, kernel: Kernel, latent: Tensor, ends: tuple[Tensor, Tensor], guidance: Guidance
+) -> Tensor:
+    """Return log p(g | z) of latent vectors up to a constant, shape (B,): minus the collision cost of their paths.
+
+    Args:
+        autoencoder: Decoder of the latent vectors.
+        kernel: The robot among its obstacles.
+        latent: Latent vectors z, shape (B, *latent).
+        ends: Starts and goals, each of shape (B, dof) [rad].
+        guidance: Margin of the cost, and number of states.
+    """
+    paths = autoencoder.decode(latent, *ends)[:, guidance.states(autoencoder.spline.states)]
+    found = collision_cost(kernel, paths.detach().cpu().double().numpy(), guidance.margin)
+    return -with_slopes(paths, *(torch.from_numpy(values).to(paths) for values in found))
+
+
+def gradient(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor:
+    """Return the gradient, of the shape of ``at``, of a function from (B, ...) to one number a row, (B,)."""
+    with torch.enable_grad():
+        inside = at.detach().requires_grad_()
+        found: Tensor = torch.autograd.grad(function(inside).sum(), inside)[0]
+    return found
 
 
 class TorchModel(TrajectoryModel):
@@ -48,7 +93,7 @@ class TorchModel(TrajectoryModel):
         return self.network.probe_offset.device
 
     def one_thread(self) -> AbstractContextManager[None]:
-        """Let torch compute by one thread inside a block."""
+        """Limit torch to one thread inside a block."""
         return one_torch_thread()
 
     def zeros(self, count: int) -> Tensor:
@@ -63,12 +108,14 @@ class TorchModel(TrajectoryModel):
     @torch.no_grad()
     def condition(self, queries: Sequence[Query], kernel: Kernel) -> Tensor:
         """Return the encoded conditions of Q queries, shape (Q, out)."""
-        found: Tensor = self.network.encoder(batch_queries(queries, self.sight or self.probes, kernel).to(self.device))
+        found: Tensor = self.network.encoder(
+            batch_queries(queries, self.scene_encoding or self.probes, kernel).to(self.device)
+        )
         return found
 
     @torch.no_grad()
     def refine(self, condition: Tensor, along: NDArray[np.float32]) -> Tensor:
-        """Return encoded conditions with what lies along estimates of paths, features of shape (B, F)."""
+        """Return encoded conditions refined by features along estimated paths, shape (B, F)."""
         return self.network.encoder.refine(condition, self._tensor(along))
 
     @torch.no_grad()
@@ -131,3 +178,99 @@ def torch_model(
     except (RuntimeError, AssertionError) as error:
         raise ParameterError("device", str(device), "a device of torch's that is there") from error
     return TorchModel(network, config.trained)
+
+
+def save_model(
+    folder: str | os.PathLike[str],
+    network: LatentDiffusion,
+    trained: Mapping[str, Any],
+    *,
+    bits: Literal[8, 16, 32] = 16,
+) -> None:
+    """Write a checkpoint with its model card, completely or not at all; an existing one is replaced.
+
+    Args:
+        folder: Folder of the checkpoint.
+        network: The model.
+        trained: Record of its training, ready for JSON.
+        bits: Size of a stored weight; 8 is for large matrices, with all others in half precision.
+
+    Raises:
+        MissingFileError: The folder cannot be written, or is not a checkpoint's.
+    """
+    kept: dict[str, NDArray[Any]] = {
+        name: (tensor.half() if bits < 32 and tensor.is_floating_point() else tensor).cpu().contiguous().numpy()
+        for name, tensor in network.state_dict().items()
+    }
+    weights = save_arrays(quantized(kept) if bits == 8 else kept)
+    config = {
+        "schema": SCHEMA, "model": network.config.model_dump(mode="json"),
+        "digest": hashlib.sha256(weights).hexdigest(), "trained": dict(trained),
+    }  # fmt: skip
+    card = model_card(network.config, trained, sum(p.numel() for p in network.parameters()))
+    write_checkpoint(Path(folder), config, weights, card)
+
+
+def write_checkpoint(folder: Path, config: Mapping[str, Any], weights: bytes, card: str) -> None:
+    """Write the files of a checkpoint, all of them or none; those of an existing one are replaced.
+
+    Args:
+        folder: Folder of the checkpoint.
+        config: Its configuration, ready for JSON.
+        weights: Content of the file of weights.
+        card: Its model card, Markdown.
+
+    Raises:
+        MissingFileError: The folder cannot be written, or is not a checkpoint's.
+    """
+    if folder.exists() and not is_file(folder / CONFIG):
+        raise MissingFileError(str(folder), "folder for a checkpoint", "something else is there")
+    content = {WEIGHTS: weights, CARD: card.encode(), CONFIG: (json.dumps(config, indent=1) + "\n").encode()}
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for left in folder.parent.glob(f".{folder.name}.*{PART}"):  # left by a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=PART, dir=folder.parent))
+    except (OSError, ValueError) as error:
+        why = (getattr(error, "strerror", None) or str(error)).lower()
+        raise MissingFileError(str(folder), "folder for a checkpoint", why) from error
+    new, old = temporary / "new", temporary / "old"
+    try:
+        new.mkdir()
+        for name, data in content.items():
+            (new / name).write_bytes(data)
+        if folder.exists():
+            os.replace(folder, old)
+        os.replace(new, folder)
+    except OSError as error:
+        if old.exists() and not folder.exists():
+            os.replace(old, folder)
+        raise MissingFileError(str(folder), "folder for a checkpoint", str(error.strerror).lower()) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def model_card(config: ModelConfig, trained: Mapping[str, Any], weights: int) -> str:
+    """Return a model card, Markdown.
+
+    Args:
+        config: Configuration of the model.
+        trained: Record of its training.
+        weights: Number of weights.
+    """
+    latent, condition, noise = config.latent, config.condition, config.noise
+    size = f"{latent.dim} components" if latent.kind == "linear" else f"{latent.channels} channels"
+    lines = [
+        f"# A latent diffusion model of paths for {config.robot}",
+        "",
+        f"{weights / 1e6:.2f} million weights: a {latent.kind} latent space of {size}, a denoiser of kind "
+        f"{config.denoiser.kind}, scene {condition.scene!r}, {noise.prediction} prediction over {noise.steps} steps.",
+    ]
+    if {"phase", "step", "seconds", "paths"} <= trained.keys():
+        lines += [
+            "",
+            f"Trained by `scripts/train.py`: {trained['phase']}, step {trained['step']}, {trained['seconds'] / 60:.0f} "
+            f"min, {trained['paths']} paths in memory (mirror images counted). The configuration is in `config.json`.",
+        ]
+    lines += ["", "It proposes paths; they are not valid until they are checked. `apex_ompl.load_model` reads it.", ""]
+    return "\n".join(lines)

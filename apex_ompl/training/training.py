@@ -5,38 +5,176 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
-from apex_ompl.errors import ApexError, FileFormatError
+from apex_ompl.errors import ApexError, FileFormatError, ParameterError
 from apex_ompl.kernel import RobotTables
+from apex_ompl.model.config import ModelConfig, SplineConfig, key_shapes
 from apex_ompl.model.proposals import Sampling
-from apex_ompl.training.autoencoder import VariationalLatent
-from apex_ompl.training.checkpoint_writer import save_model
+from apex_ompl.training.autoencoder import LinearLatent, VariationalLatent
 from apex_ompl.training.conditions import Conditions
 from apex_ompl.training.config import TrainingConfig
 from apex_ompl.training.data import TrainingData
-from apex_ompl.training.distributed import DistributedProcess
-from apex_ompl.training.initialization import initial_network
 from apex_ompl.training.kernel_problems import KernelProblem
-from apex_ompl.training.latent_diffusion import Draws, LatentDiffusion
-from apex_ompl.training.objective import Objective
-from apex_ompl.training.runlog import RunLog
-from apex_ompl.training.torch_model import TorchModel
-from apex_ompl.training.training_state import EXPECTED, STATE, read_state, write_state
+from apex_ompl.training.latent_diffusion import CollisionCost, Draws, FeaturesAlong, LatentDiffusion
+from apex_ompl.training.run_files import EXPECTED, STATE, RunLog, read_state, write_state
+from apex_ompl.training.torch_model import TorchModel, load_torch_model, save_model
 from apex_ompl.training.validation import success_rates
 from apex_ompl.util.files import check_writable, is_file
 
+NETWORKS = ("latent", "condition", "denoiser", "noise")  # parts of a model that a configuration sets
 VALIDATION_PATHS = 2048  # most held-out paths on which the validation loss is taken
 PHASES = ("autoencoder", "denoiser")
 MAX_SKIPPED = 20  # steps in a row whose gradient is not finite
+
+
+@dataclass(frozen=True)
+class DistributedProcess:
+    """One of the processes that train a model together (``torch.distributed``).
+
+    Attributes:
+        rank: Its rank, 0 to ``world_size - 1``.
+        world_size: Number of processes.
+        device: Device that it computes on.
+    """
+
+    rank: int
+    world_size: int
+    device: torch.device
+
+    @classmethod
+    def current(cls) -> DistributedProcess:
+        """Return this process; where ``torchrun`` started it, join the process group."""
+        rank, world_size, local = (
+            int(os.environ.get(k, d)) for k, d in (("RANK", 0), ("WORLD_SIZE", 1), ("LOCAL_RANK", 0))
+        )
+        cuda = torch.cuda.is_available()
+        device = torch.device("cuda", local) if cuda else torch.device("cpu")
+        if cuda:
+            torch.cuda.set_device(device)
+        if world_size > 1 and not distributed.is_initialized():
+            distributed.init_process_group("nccl" if cuda else "gloo")
+        return cls(rank, world_size, device)
+
+    def any(self, flag: bool) -> bool:
+        """Return whether a flag is set in any of the processes; the same answer in all of them."""
+        if self.world_size == 1:
+            return flag
+        value = torch.tensor(float(flag), device=self.device)
+        distributed.all_reduce(value, distributed.ReduceOp.MAX)
+        return bool(value > 0)
+
+    def close(self) -> None:
+        """Leave the process group."""
+        if self.world_size > 1 and distributed.is_initialized():
+            distributed.destroy_process_group()
+
+
+class Objective(nn.Module):
+    """Loss of a phase: the negative ELBO of the autoencoder, or the mean square error of the denoiser."""
+
+    def __init__(
+        self,
+        network: LatentDiffusion,
+        divergence: float,
+        features_along: FeaturesAlong | None = None,
+        collision_cost: CollisionCost | None = None,
+    ) -> None:
+        """Train a model.
+
+        Args:
+            network: The model.
+            divergence: Weight of the autoencoder's Kullback-Leibler divergence.
+            features_along: Returns features along paths, for a model that sees its own estimate.
+            collision_cost: Returns the collision cost of paths; None to leave it out.
+        """
+        super().__init__()
+        self.network, self.divergence = network, divergence
+        self._features_along, self._collision_cost = features_along, collision_cost
+
+    def forward(self, phase: str, control: Tensor, conditions: Conditions, draws: Draws) -> Tensor:
+        """Return the loss of a batch of paths.
+
+        Args:
+            phase: ``autoencoder`` or ``denoiser``.
+            control: Control points, shape (B, points, dof) [rad].
+            conditions: Conditions of the paths.
+            draws: Random numbers.
+        """
+        autoencoder = self.network.autoencoder
+        if phase == "autoencoder":
+            assert isinstance(autoencoder, VariationalLatent)
+            return autoencoder.loss(control, draws.noise, self.divergence)[0]
+        with torch.no_grad(), torch.autocast(control.device.type, enabled=False):
+            clean = autoencoder.encode(control)
+        return self.network.loss(clean, draws, conditions, self._features_along, self._collision_cost)
+
+
+def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTables) -> LatentDiffusion:
+    """Return a model with random weights, with the robot's limits and probe points, and a fitted linear latent space.
+
+    Where the configuration names a checkpoint, all of these are the checkpoint's.
+
+    Args:
+        config: Configuration of the run; the same seed gives the same weights.
+        data: Training data.
+        robot: Kernel tables of the robot.
+
+    Raises:
+        ApexError: The checkpoint that the run starts with cannot be read, or is of another architecture.
+    """
+    probes, encoding = data.probes, data.scene_encoding
+    arms = (0, 0) if encoding is None else encoding.keys.joint.shape
+    model = ModelConfig(
+        robot=robot.name, joints=robot.joint_names, probes=len(probes.joint), arms=arms,
+        spline=SplineConfig(**data.spline), latent=config.latent, condition=config.condition, denoiser=config.denoiser,
+        noise=config.noise, sampling=config.sampling,
+    )  # fmt: skip
+    if config.initial is not None:
+        return _of_checkpoint(config.initial, model)
+    with torch.random.fork_rng(devices=[]):  # torch's layers initialize their weights from the global generator
+        torch.manual_seed(config.seed)
+        network = LatentDiffusion(model)
+    network.probe_joint.copy_(torch.from_numpy(probes.joint))
+    network.probe_offset.copy_(torch.from_numpy(probes.offset))
+    if encoding is not None:
+        for name, values in zip(
+            key_shapes(model), (encoding.keys.state, encoding.keys.joint, encoding.keys.ball), strict=True
+        ):
+            getattr(network, name).copy_(torch.from_numpy(values))
+    limits = (torch.tensor(v, dtype=torch.float32) for v in (robot.arrays.lower, robot.arrays.upper))
+    network.encoder.set_limits(*limits)
+    if isinstance(network.autoencoder, LinearLatent):
+        network.autoencoder.fit(data.statistics_sample())
+    return network
+
+
+def _of_checkpoint(name: str, wanted: ModelConfig) -> LatentDiffusion:
+    """Return the model of a checkpoint, ready to be trained on.
+
+    Raises:
+        ApexError: It cannot be read.
+        ParameterError: It is of another architecture, the first difference of which is named.
+    """
+    network = load_torch_model(name, robot=wanted.robot).network
+    found = network.config
+    for field in (*NETWORKS, *(name for name in ModelConfig.model_fields if name not in (*NETWORKS, "sampling"))):
+        theirs, ours = getattr(found, field), getattr(wanted, field)
+        if theirs != ours:
+            expected = f"a checkpoint with the {field} of this run, {ours!r}, not {theirs!r}"
+            raise ParameterError("initial", name, expected)
+    network.config = wanted
+    return network.train().requires_grad_(True)
 
 
 class TrainingError(ApexError):
@@ -90,8 +228,8 @@ class Trainer:
         if is_file(folder / STATE):
             self._load_state()
         self._runlog = RunLog(folder, self.progress) if process.rank == 0 else None
-        collide = self._collide if config.collision else None
-        objective = Objective(self.network, config.autoencoder.divergence, self.data.look, collide)
+        collision_cost = self._collision_cost if config.collision else None
+        objective = Objective(self.network, config.autoencoder.divergence, self.data.features_along, collision_cost)
         self._objective: nn.Module = objective
         if process.world_size > 1:
             self._objective = nn.parallel.DistributedDataParallel(objective, find_unused_parameters=True)
@@ -233,9 +371,9 @@ class Trainer:
         control, conditions = shard.batch(which, generator)
         return self._evaluate(self._objective, control, conditions, generator)
 
-    def _collide(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
-        """Return what collisions of paths add to the loss."""
-        return self.config.collision * self.data.collide(control, conditions, places)
+    def _collision_cost(self, control: Tensor, conditions: Conditions, places: Tensor) -> Tensor:
+        """Return the term of the loss that is due to collisions."""
+        return self.config.collision * self.data.collision_cost(control, conditions, places)
 
     def _evaluate(
         self, objective: nn.Module, control: Tensor, conditions: Conditions, generator: torch.Generator
@@ -260,7 +398,7 @@ class Trainer:
             generator = torch.Generator().manual_seed(self.config.seed)
             which = torch.randperm(len(validation), generator=generator)[:VALIDATION_PATHS].sort().values
             control, conditions = validation.batch(which.numpy(), generator)
-            objective = Objective(network, self.config.autoencoder.divergence, self.data.look)
+            objective = Objective(network, self.config.autoencoder.divergence, self.data.features_along)
             with torch.no_grad():
                 held_out = self._evaluate(objective, control, conditions, generator)
             row["held_out"] = f"{float(held_out):.6f}"

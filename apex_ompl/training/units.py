@@ -1,16 +1,43 @@
-"""Units of work: problems of a level that are drawn, solved and stored together."""
+"""Units of work of the data engine: problems of a level that are drawn, solved with meshes, and stored together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from apex_ompl import problems
+from apex_ompl.collision.held_extent import held_extent
 from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.model.geometry import SHAPES, ObstacleRecord
+from apex_ompl.ompl.process import quiet_ompl
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.spline import Spline
 from apex_ompl.problems import scenes
 from apex_ompl.problems.broad.levels import GRAMMARS
+from apex_ompl.problems.broad.representation import part_of
 from apex_ompl.problems.catalogue import KNOWN, LEVELS, SPLITS, TRAINING, VALIDATION
+from apex_ompl.problems.generator import SuiteError
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.training.engine import Engine, EngineOptions, PathFinder, ProblemRecord
+from apex_ompl.training.kernel_problems import KernelProblem
+from apex_ompl.training.records import Paths
+from apex_ompl.types import Array
+from apex_ompl.util.resolution import SEARCH_RESOLUTION
+
+if TYPE_CHECKING:
+    from apex_ompl.model.proposals import TrajectoryModel
 
 UNIT_SIZE = 16  # problems in a unit of work
+BROAD_ITERATIONS = 8_000  # of trees among broad scenes, where a problem need not have a solution
 
 
 @dataclass(frozen=True)
@@ -101,3 +128,136 @@ def plan_units(count: int, only: Sequence[str] = (), split: str = "train") -> li
         if (k + 1) * UNIT_SIZE <= len(SPLITS[split])
     ]
     return [unit for *_, unit in sorted(found, key=lambda row: row[:2])]
+
+
+def kernel_problems(unit: Unit) -> list[KernelProblem]:
+    """Return the problems of a unit as tables of the kernel, for machines without Pinocchio, Coal and OMPL.
+
+    There obstacles are primitives, which contain the meshes and the points that a problem has.
+    """
+    found = []
+    with quiet_ompl():
+        for seed in unit.seeds:
+            try:
+                problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
+            except SuiteError:
+                continue
+            scene = problems.primitives(problem, enclosing=True)
+            setup = assemble(problem.model_copy(update={"scene": scene}), robot())
+            kernel, start, goal = setup.checker.kernel, setup.start, setup.goals[0]
+            points = np.stack([setup.checker.obstacle_point(start), setup.checker.obstacle_point(goal)])
+            names, record = (unit.name, unit.suite, unit.level, unit.strategy), problem_record(problem, seed)
+            found.append(KernelProblem(*names, record, kernel.robot, kernel.scene, start, goal, points))
+    return found
+
+
+def problem_record(problem: Problem, seed: int) -> ProblemRecord:
+    """Return the record of a problem in a data set: its obstacles as primitives, whatever they are given as.
+
+    The primitives contain the meshes and the balls around points. Held meshes are named by their files, without
+    folders; each held object has its ``extent``, see :func:`apex_ompl.collision.held_extent.held_extent`.
+    """
+    scene = problems.primitives(problem, enclosing=True)
+    return ProblemRecord(seed, held_text(problem.attached), [_obstacle_record(obstacle) for obstacle in scene])
+
+
+def held_text(attached: Sequence[AttachedObject]) -> str:
+    """Return held objects as JSON, as data sets store them."""
+    bodies = [h.model_dump(mode="json", exclude_defaults=True) for h in attached]
+    for body, held in zip(bodies, attached, strict=True):
+        if "mesh" in body:
+            body["mesh"]["file"] = Path(body["mesh"]["file"]).name
+        body["extent"] = np.round(held_extent(held), 4).tolist()
+    return json.dumps(bodies)
+
+
+def _obstacle_record(obstacle: Obstacle) -> ObstacleRecord:
+    """Return shape index, position, orientation and size of an obstacle.
+
+    Raises:
+        UnknownNameError: The obstacle is a mesh or a half-space.
+    """
+    if obstacle.shape not in SHAPES:
+        raise UnknownNameError("shape of an obstacle in a data set", obstacle.shape, SHAPES)
+    part = part_of(obstacle)
+    return part.kind, obstacle.position, obstacle.orientation, part.size
+
+
+def solve_unit(unit: Unit, options: EngineOptions, spline: Spline) -> tuple[Paths, dict[str, float]]:
+    """Draw and solve the problems of a unit; the same arguments give the same paths.
+
+    Returns:
+        The paths, and the time by stage [s].
+    """
+    engine = Engine(unit.name, (unit.suite, unit.level), unit.strategy, options, spline)
+    model = _model(options.model, spline) if options.model else None
+    with quiet_ompl():
+        for seed in unit.seeds:
+            with engine.timed("draw"):
+                try:
+                    problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
+                    finder = MeshPathFinder(assemble(problem, robot()), engine.optimizer)
+                except SuiteError:
+                    engine.counts["not drawn"] += 1
+                    continue
+            if unit.strategy == "broad":
+                finder.iterations = BROAD_ITERATIONS
+            if model is not None:
+                finder.proposer = _proposer(model, finder)
+            engine.solve(finder, problem_record(finder.setup.problem, seed))
+    return engine.paths(robot().name, robot().joint_names), engine.times
+
+
+@cache
+def _model(name: str, spline: Spline) -> TrajectoryModel:
+    """Return a model of paths by a spline.
+
+    Raises:
+        ApexError: There is no such model, or it is for another robot or spline.
+    """
+    from apex_ompl.model.checkpoint import load_model
+
+    model = load_model(name, robot=robot().name)
+    if model.spline != spline:
+        raise ParameterError("model", name, f"one of paths by {spline}")
+    return model
+
+
+def _proposer(model: TrajectoryModel, finder: MeshPathFinder) -> Callable[[int, int], Array]:
+    """Return a function from a count and a seed to a model's proposals for a problem."""
+    from apex_ompl.apex.query import make_query
+
+    def propose(count: int, seed: int) -> Array:
+        query = make_query(finder.setup.checker, finder.start, finder.goal, point=model.sees_point)
+        with model.one_thread():
+            return model.propose(query, finder.kernel, count, generator=np.random.default_rng(seed)).control
+
+    return propose
+
+
+class MeshPathFinder(PathFinder):
+    """Checks paths with meshes, and finds obstacle points by GJK.
+
+    Attributes:
+        setup: The problem, ready for OMPL.
+    """
+
+    def __init__(self, setup: PlanningSetup, optimizer: Optimizer) -> None:
+        """Find paths from the start to the first goal of ``setup``."""
+        super().__init__(setup.checker.kernel, setup.start, setup.goals[0], optimizer)
+        self.setup = setup
+
+    def proves(self, states: Array) -> bool:
+        """Whether a path, shape (N, dof), inside of the limits is proved free, by the meshes where it takes them."""
+        return bool(self.setup.checker.prove(states))
+
+    def is_free(self, line: Array) -> bool:
+        """Whether a straight motion, shape (2, dof), is free at the resolution that planners search with."""
+        return self.setup.checker.first_collision(line, SEARCH_RESOLUTION) is None
+
+    def obstacle_point(self, q: Array) -> Array:
+        """Return the obstacle point nearest to the robot by GJK, fixtures such as tables excluded, shape (3,) [m]."""
+        key = q.tobytes()
+        if key not in self.points:
+            self.points[key] = self.setup.checker.obstacle_point(q)
+        return self.points[key]

@@ -14,7 +14,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop.result import RunResult
 from apex_ompl.moving.dynamic_obstacles import ScriptedDynamicObstacles
 from apex_ompl.robot import Robot
-from apex_ompl.timing.rests import rests
+from apex_ompl.timing.trajectory import rests
 from apex_ompl.types import Array
 from apex_ompl.util.files import suffix_of, write_atomically
 from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, SILENT_EVENTS, WAY_COLORS

@@ -26,8 +26,7 @@ from apex_ompl.model.array_model import ArrayModel
 from apex_ompl.model.proposals import Proposals, TrajectoryModel
 from apex_ompl.model.query import ObstacleSet, Query
 from apex_ompl.ompl.parameters import register
-from apex_ompl.training.data import shard_paths
-from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.data import Mirror, shard_paths
 from apex_ompl.training.records import Paths, held_extents
 from apex_ompl.training.torch_model import load_torch_model
 from benchmarks.lib.controls import Shuffled, drawn

@@ -51,7 +51,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.problems import worlds
 from apex_ompl.timing import time_path
-from apex_ompl.timing.moving_start import between, through
+from apex_ompl.timing.ruckig_method import between, through
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically

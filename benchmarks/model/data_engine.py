@@ -25,9 +25,8 @@ import numpy as np
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems import scenes
 from apex_ompl.training.engine import EngineOptions
-from apex_ompl.training.problem_solving import solve_unit
 from apex_ompl.training.records import SOURCES
-from apex_ompl.training.units import UNIT_SIZE, Unit, level_weight, static_levels
+from apex_ompl.training.units import UNIT_SIZE, Unit, level_weight, solve_unit, static_levels
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 from benchmarks.lib import record

@@ -43,8 +43,7 @@ from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import path_length
 from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.training.data import shard_paths
-from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.data import Mirror, shard_paths
 from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number

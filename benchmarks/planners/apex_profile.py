@@ -27,8 +27,7 @@ from apex_ompl.evaluation import Row, Workers, bench, runs
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.evaluation.summary import Statistics
-from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.paths.settings import OptimizerSettings
+from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.result import FIRST, INSIDE
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more

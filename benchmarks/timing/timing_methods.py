@@ -14,8 +14,7 @@ from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.curve import Curve, Polyline
-from apex_ompl.timing.ruckig_method import stops
-from apex_ompl.timing.ruckig_profiles import calculate, knots
+from apex_ompl.timing.ruckig_method import calculate, knots, stops
 from apex_ompl.timing.spline_method import (
     CONTROL_POINT_SPACING,
     GRID_POINTS_PER_SPAN,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.goals.hand_poses import Direction
+from apex_ompl.goals.state_sampling import Direction
 from apex_ompl.problems.broad.shapes import Parts, Point, mirror, place, turn
 from apex_ompl.types import Array
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.goals.hand_poses import Direction
+from apex_ompl.goals.state_sampling import Direction
 from apex_ompl.problems.broad.composition import FLOATING, Composition, Place, at
 from apex_ompl.problems.broad.compounds import SIDES, frame, grille, hollow_box, lattice, ring, tube
 from apex_ompl.problems.broad.shapes import (

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives
-from apex_ompl.goals.cover_clearance import has_clearance
-from apex_ompl.goals.hand_poses import HandPoseSampler, HandRegion
 from apex_ompl.goals.inverse_kinematics import Links
+from apex_ompl.goals.state_sampling import HandPoseSampler, HandRegion, has_clearance
 from apex_ompl.kernel import Kernel, RobotTables, SceneTables
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of
 from apex_ompl.problems.broad.composition import Place

@@ -16,7 +16,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import SceneError
 from apex_ompl.goals.grasp import grasp
-from apex_ompl.goals.hand_poses import DualArmTables
+from apex_ompl.goals.state_sampling import DualArmTables
 from apex_ompl.problems.objects import ALONG_X, PALM, cup
 from apex_ompl.problems.suite_robot import empty_hand_tables, robot
 from apex_ompl.scene.bodies import AttachedObject

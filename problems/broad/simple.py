@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.goals.cover_clearance import scene_kernel
-from apex_ompl.goals.hand_poses import HandPoseSampler, HandRegion, Interval
 from apex_ompl.goals.inverse_kinematics import Links
+from apex_ompl.goals.state_sampling import HandPoseSampler, HandRegion, Interval, scene_kernel
 from apex_ompl.kernel import RobotTables
 from apex_ompl.problems import alignment
 from apex_ompl.problems.drawn_problem import MARGIN, DrawnProblem

@@ -28,11 +28,10 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.autoencoder import Autoencoder
 from apex_ompl.training.engine import EngineOptions
-from apex_ompl.training.problem_solving import solve_unit
 from apex_ompl.training.records import SOURCES, Paths
 from apex_ompl.training.store import Store
 from apex_ompl.training.torch_model import load_torch_model
-from apex_ompl.training.units import plan_units
+from apex_ompl.training.units import plan_units, solve_unit
 from apex_ompl.types import Array
 from apex_ompl.util.cluster import spread
 

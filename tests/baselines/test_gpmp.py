@@ -21,8 +21,7 @@ from apex_ompl.moving.context import Following
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.replanner import Request
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.paths.settings import OptimizerSettings
+from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.paths.spline import Spline
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot

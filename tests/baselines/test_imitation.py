@@ -23,7 +23,7 @@ from apex_ompl.errors import ApexError, FileFormatError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.training.conditions import Conditions, batch_queries
-from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.data import Mirror
 from apex_ompl.training.records import Paths
 from apex_ompl.training.store import load
 from apex_ompl.util.threads import one_torch_thread

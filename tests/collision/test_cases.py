@@ -18,12 +18,11 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
+from apex_ompl.training.engine import PathFinder
 from apex_ompl.training.kernel_problems import KernelProblem, load_kernel_problems, save_kernel_problems
-from apex_ompl.training.path_finder import PathFinder
-from apex_ompl.training.problem_records import kernel_problems
 from apex_ompl.training.records import SOURCES
 from apex_ompl.training.store import Store
-from apex_ompl.training.units import Unit
+from apex_ompl.training.units import Unit, kernel_problems
 
 WITHOUT = """
 import runpy, sys
@@ -71,7 +70,7 @@ def test_they_are_solved_without_pinocchio_coal_and_ompl(cases: list[KernelProbl
         for k, control in enumerate(paths.control()):
             ready = assemble(problems.load(paths.problem_name(int(paths.arrays["problem"][k]))), robot())
             assert full_check(ready.checker, spline.path(control), paths.start[k], [paths.goal[k]])
-            assert SOURCES[paths.arrays["source"][k]] in ("line", "bumps", "rrtconnect", "reversed")
+            assert SOURCES[paths.arrays["source"][k]] in ("line", "perturbation", "rrtconnect", "reversed")
             seen += 1
     assert seen >= 8
 
@@ -98,7 +97,7 @@ def test_parts_of_paths_are_valid_where_the_straight_line_is_not(cases: list[Ker
     kept = left_out = 0
     for case in cases:
         finder = PathFinder(Kernel(case.robot, case.scene), case.start, case.goal, Optimizer(spline))
-        path = finder.optimize_bumps(rng, line=False, many=True)
+        path = finder.optimize_perturbations(rng, line=False, many=True)
         if path is None:
             continue
         states = spline.path(path)

@@ -10,9 +10,8 @@ from support import DATA, ROOT
 
 from apex_ompl.model.query import ObstacleSet, Query
 from apex_ompl.training.config import TrainingConfig
-from apex_ompl.training.distributed import DistributedProcess
 from apex_ompl.training.records import Paths
-from apex_ompl.training.training import Trainer
+from apex_ompl.training.training import DistributedProcess, Trainer
 
 SCRIPT = ROOT / "scripts" / "train.py"
 HERE = DistributedProcess(0, 1, torch.device("cpu"))

@@ -18,8 +18,7 @@ from apex_ompl.loop.metrics import failure_ratio, run_metrics
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.robot import Robot
 from apex_ompl.timing.files import KNOTS
-from apex_ompl.timing.rests import is_at_rest, rests
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import concatenate, is_at_rest, rests
 
 
 @pytest.fixture(scope="module")

@@ -29,14 +29,13 @@ from models import (
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled.dense_layer import dense_layer
-from apex_ompl.model.array_model import ArrayModel, is_supported, weight_shapes
+from apex_ompl.model.array_model import ArrayModel, expanded, is_supported, quantized, weight_shapes
 from apex_ompl.model.checkpoint import load_model
 from apex_ompl.model.config import ConditionConfig, DenoiserConfig, LatentConfig, NoiseConfig
+from apex_ompl.model.diffusion import SAMPLERS
 from apex_ompl.model.guidance import Guidance
 from apex_ompl.model.proposals import Sampling
-from apex_ompl.model.quantization import expanded, quantized
 from apex_ompl.model.query import ObstacleSet, Query
-from apex_ompl.model.sampler import SAMPLERS
 from apex_ompl.training.latent_diffusion import LatentDiffusion
 from apex_ompl.training.torch_model import TorchModel, load_torch_model
 

@@ -23,11 +23,10 @@ import apex_ompl
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.model.array_model import expanded, quantized
 from apex_ompl.model.checkpoint import load_model
-from apex_ompl.model.quantization import expanded, quantized
-from apex_ompl.training.checkpoint_writer import save_model
 from apex_ompl.training.store import load
-from apex_ompl.training.torch_model import load_torch_model
+from apex_ompl.training.torch_model import load_torch_model, save_model
 from apex_ompl.training.training import Trainer
 from apex_ompl.util.threads import one_torch_thread
 

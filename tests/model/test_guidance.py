@@ -13,15 +13,14 @@ from models import POST, VARIATIONAL, WALL, kernel, network, query, some_paths
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import Kernel
 from apex_ompl.model.config import NoiseConfig
+from apex_ompl.model.diffusion import SAMPLERS
 from apex_ompl.model.guidance import Guidance, collision_cost
 from apex_ompl.model.proposals import Sampling
 from apex_ompl.model.query import ObstacleSet, Query
-from apex_ompl.model.sampler import SAMPLERS
 from apex_ompl.paths.spline import Spline
-from apex_ompl.training.cost_gradient import gradient, log_likelihood
-from apex_ompl.training.denoisers import UNetDenoiser
 from apex_ompl.training.latent_diffusion import LatentDiffusion
-from apex_ompl.training.torch_model import TorchModel
+from apex_ompl.training.networks import UNetDenoiser
+from apex_ompl.training.torch_model import TorchModel, gradient, log_likelihood
 
 
 @pytest.mark.parametrize("parts", [{}, VARIATIONAL], ids=["linear", "variational"])

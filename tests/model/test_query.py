@@ -14,7 +14,7 @@ from apex_ompl.model.query import ObstacleSet
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import HalfSpace, Obstacle
-from apex_ompl.training.problem_records import problem_record
+from apex_ompl.training.units import problem_record
 
 
 def sorted_rows(obstacles: ObstacleSet) -> np.ndarray:

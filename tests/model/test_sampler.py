@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.model.sampler import SAMPLERS, ddim, ddpm, dpm_solver
-from apex_ompl.model.schedule import PREDICTIONS, SCHEDULES, Estimate, NoiseSchedule
+from apex_ompl.model.diffusion import PREDICTIONS, SAMPLERS, SCHEDULES, Estimate, NoiseSchedule, ddim, ddpm, dpm_solver
+from apex_ompl.training.latent_diffusion import TrainingSchedule
 
 # Noise
 
@@ -28,7 +28,7 @@ def test_noise_grows_from_almost_none_to_almost_all(kind: str, steps: int) -> No
 
 @given(st.sampled_from(PREDICTIONS), st.sampled_from(SCHEDULES), st.integers(1, 254), st.integers(0, 2**31))
 def test_what_a_perfect_network_says_gives_sample_and_noise_back(kind: str, name: str, t: int, seed: int) -> None:
-    schedule, g = NoiseSchedule(256, name), torch.Generator().manual_seed(seed)
+    schedule, g = TrainingSchedule(256, name), torch.Generator().manual_seed(seed)
     clean, noise = (torch.randn(3, 5, generator=g, dtype=torch.float64) for _ in range(2))
     sample = schedule.add_noise(clean, noise, t)
     found = schedule.estimate(kind, sample, schedule.target(kind, clean, noise, torch.full((3,), t)), t)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
-from apex_ompl.goals.cover_clearance import scene_kernel
+from apex_ompl.goals.state_sampling import scene_kernel
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time, prove_motion
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle

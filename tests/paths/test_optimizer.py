@@ -10,9 +10,8 @@ from apex_ompl.kernel import Kernel, scene_tables
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.candidates import Candidate, CandidatePool, first_valid
-from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.paths.path import path_length
-from apex_ompl.paths.settings import OptimizerSettings
 from apex_ompl.paths.spline import Spline
 from apex_ompl.robot import Robot
 from apex_ompl.util.resolution import FINE_RESOLUTION

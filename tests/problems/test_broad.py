@@ -38,8 +38,7 @@ from apex_ompl.problems.frozen import digest
 from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import empty_hand_tables
 from apex_ompl.robot import Robot
-from apex_ompl.training.problem_records import problem_record
-from apex_ompl.training.units import Unit, plan_units
+from apex_ompl.training.units import Unit, plan_units, problem_record
 
 LEVELS = [(suite, level) for suite, levels in GRAMMARS.items() for level in levels]
 FREE = 800_500  # seeds of validation from here on are not frozen

@@ -8,7 +8,7 @@ from timings import LIMITS, NAMES, RATE, paths, timed
 
 from apex_ompl.errors import TimingError
 from apex_ompl.timing import Timing, time_path
-from apex_ompl.timing.moving_start import between, through
+from apex_ompl.timing.ruckig_method import between, through
 from apex_ompl.timing.trajectory import concatenate
 
 

@@ -20,8 +20,7 @@ from apex_ompl.model.query import ObstacleSet, Probes, Query
 from apex_ompl.paths.spline import Spline
 from apex_ompl.training.autoencoder import LinearLatent, VariationalLatent
 from apex_ompl.training.conditions import ConditionTable, batch_queries
-from apex_ompl.training.denoisers import UNetDenoiser
-from apex_ompl.training.encoders import ConditionEncoder
+from apex_ompl.training.networks import ConditionEncoder, UNetDenoiser
 from apex_ompl.training.torch_model import TorchModel
 
 # Latent spaces

@@ -21,10 +21,9 @@ from apex_ompl.paths.path import path_length
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.engine import STRAIGHT_SHARE, EngineOptions
-from apex_ompl.training.problem_solving import solve_unit
 from apex_ompl.training.records import FIELDS, SOURCES, Paths, to_half
 from apex_ompl.training.store import Store, load
-from apex_ompl.training.units import Unit, plan_units, static_levels
+from apex_ompl.training.units import Unit, plan_units, solve_unit, static_levels
 from apex_ompl.util.cluster import ClusterError, spread
 
 SCRIPT = ROOT / "scripts" / "generate_data.py"
@@ -77,7 +76,7 @@ def test_every_path_passes_the_full_check_and_its_record_is_true(made: list[Path
             np.testing.assert_allclose(a["position"][mine], [o.position for o in things] or np.zeros((0, 3)), atol=1e-6)
             for number, obstacle in zip(a["shape"][mine], things, strict=True):
                 assert getattr(obstacle, SHAPES[number]) is not None
-    assert {"bumps", "rrtconnect", "reversed", "part"} <= sources
+    assert {"perturbation", "rrtconnect", "reversed", "part"} <= sources
     assert inner > 0, "some parts end where no path does"
 
 

@@ -14,8 +14,7 @@ import pytest
 
 from apex_ompl.errors import ApexError, FileFormatError, FolderInUseError, MissingFileError
 from apex_ompl.paths.spline import Spline
-from apex_ompl.training.description import duplicates, level_statistics
-from apex_ompl.training.records import FIELDS, DatasetError, Paths, from_micro, to_micro
+from apex_ompl.training.records import FIELDS, DatasetError, Paths, duplicates, from_micro, level_statistics, to_micro
 from apex_ompl.training.store import Store, load, save
 
 DOF, FREE = 5, 12
@@ -238,7 +237,7 @@ def test_duplicates_and_figures_are_counted() -> None:
     assert duplicates(twins).tolist() == [False, False, False, True, False, False]
     first, all_of_them = level_statistics(twins)
     assert (first.name, all_of_them.name) == ("shelf/easy", "all")
-    assert all_of_them.sources == {"line": 1, "bumps": 1, "rrtconnect": 2, "reversed": 1, "part": 1, "model": 0}
+    assert all_of_them.sources == {"line": 1, "perturbation": 1, "rrtconnect": 2, "reversed": 1, "part": 1, "model": 0}
     assert (all_of_them.straight, all_of_them.homotopies, all_of_them.several) == (0.5, 2.0, 1.0)
     assert all_of_them.duplicates == 1
     assert all_of_them.length[1] == pytest.approx(np.median(arrays["length"]))

@@ -25,13 +25,12 @@ from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.proposals import Sampling
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.training.distributed import DistributedProcess
 from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems
 from apex_ompl.training.records import Paths
-from apex_ompl.training.runlog import read_log
+from apex_ompl.training.run_files import read_log
 from apex_ompl.training.store import Store, load, save
 from apex_ompl.training.torch_model import TorchModel, load_torch_model
-from apex_ompl.training.training import Trainer, TrainingError
+from apex_ompl.training.training import DistributedProcess, Trainer, TrainingError
 from apex_ompl.training.validation import query_from_problem, success_rates
 from apex_ompl.util.resolution import FINE_RESOLUTION
 from apex_ompl.util.threads import one_torch_thread
@@ -100,9 +99,10 @@ def test_estimates_of_a_model_that_pays_for_collisions_have_fewer(few: Path, tmp
         trainer.run()
         data, generator, network = trainer.data, torch.Generator().manual_seed(0), trainer.averaged_network()
         control, conditions = data.shard.batch(np.arange(len(data.shard)), generator)
-        batch = network.autoencoder.encode(control), network.draws(len(control), generator), conditions, data.look
+        clean, draws = network.autoencoder.encode(control), network.draws(len(control), generator)
+        batch = clean, draws, conditions, data.features_along
         with torch.no_grad():
-            costs.append(float(network.loss(*batch, data.collide) - network.loss(*batch)))
+            costs.append(float(network.loss(*batch, data.collision_cost) - network.loss(*batch)))
     assert costs[1] < 0.8 * costs[0]
 
 
@@ -237,8 +237,8 @@ def test_a_run_begins_with_the_weights_of_a_checkpoint(
     second = Trainer(config(others, **again), tmp_path, HERE)
     assert second.about()["config"]["initial"] == "checkpoint", "without its folder"
     assert_same(second.network.state_dict(), wanted)
-    if second.data.sight is not None:
-        assert np.array_equal(second.data.sight.keys.state, wanted["key_state"].numpy()), "it sees what it saw"
+    if second.data.scene_encoding is not None:
+        assert np.array_equal(second.data.scene_encoding.keys.state, wanted["key_state"].numpy()), "it sees what it saw"
     second.advance()
     moved = [float((p.detach() - wanted[name]).abs().max()) for name, p in second.network.named_parameters()]
     assert 0.0 < max(moved) < 1e-6, "it is trained"

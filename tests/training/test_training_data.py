@@ -15,8 +15,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.compiled.arrays import BOX
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
-from apex_ompl.training.data import is_held_out, shard_paths, split
-from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.data import Mirror, is_held_out, shard_paths, split
 from apex_ompl.training.records import Paths
 from apex_ompl.training.store import Store, save
 from apex_ompl.training.training import Trainer

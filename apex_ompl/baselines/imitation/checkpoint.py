@@ -16,7 +16,7 @@ from apex_ompl.baselines.imitation.config import NetworkConfig
 from apex_ompl.baselines.imitation.network import PolicyNetwork
 from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.model.checkpoint import CONFIG, WEIGHTS, check_shapes, read_weights
-from apex_ompl.training.checkpoint_writer import write_checkpoint
+from apex_ompl.training.torch_model import write_checkpoint
 from apex_ompl.util.files import is_file
 from apex_ompl.util.schema import StrictModel, read_json, validate
 

@@ -18,8 +18,7 @@ from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.query import Probes
 from apex_ompl.paths.spline import Spline
 from apex_ompl.training.conditions import Conditions
-from apex_ompl.training.data import Shard, shard_paths, split
-from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.data import Mirror, Shard, shard_paths, split
 from apex_ompl.training.records import Paths
 
 NO_PROBES = Probes(np.zeros(0, np.int64), np.zeros((0, 3)), 1)

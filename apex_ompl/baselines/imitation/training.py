@@ -20,9 +20,8 @@ from apex_ompl.baselines.imitation.data import WindowData, Windows
 from apex_ompl.baselines.imitation.network import PolicyNetwork
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import RobotTables
-from apex_ompl.training.runlog import RunLog
+from apex_ompl.training.run_files import EXPECTED, STATE, RunLog, read_state, write_state
 from apex_ompl.training.training import MAX_SKIPPED, TrainingError
-from apex_ompl.training.training_state import EXPECTED, STATE, read_state, write_state
 from apex_ompl.util.files import check_writable, is_file
 from apex_ompl.util.provenance import commit, hardware
 

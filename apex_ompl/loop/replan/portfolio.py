@@ -16,7 +16,7 @@ from apex_ompl.moving.retime import retime
 from apex_ompl.moving.search import Search, Source
 from apex_ompl.moving.timed_spline import MOST_ROUNDS, MotionCandidate, MotionPool
 from apex_ompl.timing import Trajectory
-from apex_ompl.timing.moving_start import through
+from apex_ompl.timing.ruckig_method import through
 from apex_ompl.types import Array
 
 FACTORS = ((1.3, 2.5), (1.0, 1.8))  # durations that are tried, as multiples of the shortest one; by turns

@@ -23,7 +23,7 @@ from apex_ompl.moving.search import (
     shortest_duration,
 )
 from apex_ompl.ompl.tuned import TUNED
-from apex_ompl.paths.optimizer import Optimizer
+from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.paths.path import resample
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
@@ -81,7 +81,7 @@ class Lines:
     """
 
     perturbed: int = 0
-    size: float = 0.6
+    size: float = PERTURBATION_SIZE
     goals: int = 2
     name: str = "line"
 

@@ -1,4 +1,4 @@
-"""Log of a training run: a CSV file, and TensorBoard event files where TensorBoard is installed."""
+"""Files of a training run: its log, as CSV and for TensorBoard, and the state from which it is resumed."""
 
 from __future__ import annotations
 
@@ -8,12 +8,17 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.util.files import is_file, read_text, write_atomically
 
 FIELDS = ("phase", "step", "loss", "held_out", "rate", "seconds", "sampled", "repaired", "levels")
 PLOTTED = ("loss", "held_out", "rate", "sampled", "repaired")
 FILE = "log.csv"
+STATE = "state.pt"
+KEYS = ("phase", "step", "number", "left", "seconds", "network", "averaged", "optimizer")
+EXPECTED = "expected the state of a training run"
 
 
 def read_log(folder: Path) -> list[dict[str, str]]:
@@ -77,3 +82,37 @@ class RunLog:
                 if name in row:
                     self._board.add_scalar(f"{row['phase']}/{name}", float(row[name]), int(row["step"]))
             self._board.flush()
+
+
+def write_state(folder: Path, digest: str, values: Mapping[str, Any]) -> None:
+    """Write the state of a run.
+
+    Args:
+        folder: Folder of the run.
+        digest: Digest of the settings and data that determine the trained weights.
+        values: Values of :data:`KEYS`.
+
+    Raises:
+        MissingFileError: The file cannot be written.
+    """
+    stream = io.BytesIO()
+    torch.save({"essence": digest, **{key: values[key] for key in KEYS}}, stream)
+    write_atomically(folder / STATE, stream.getvalue())
+
+
+def read_state(folder: Path, digest: str, device: torch.device) -> dict[str, Any]:
+    """Read the state of a run.
+
+    Raises:
+        FileFormatError: The file is damaged, or of a run with other settings or data.
+    """
+    path = folder / STATE
+    try:
+        state: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+        found = state["essence"]
+    except Exception as error:  # zipfile and pickle let many kinds through
+        raise FileFormatError(str(path), "", type(error).__name__, EXPECTED) from error
+    if found != digest:
+        expected = "expected the state of a run with this configuration and these data; take another folder"
+        raise FileFormatError(str(path), "essence", found[:12], expected)
+    return state

@@ -24,17 +24,16 @@ from apex_ompl.kernel.point_distances import nearest_points
 from apex_ompl.model.array_model import ArrayModel
 from apex_ompl.model.config import PIECES
 from apex_ompl.model.query import MAX_DISTANCE, ObstacleSet, Probes
-from apex_ompl.model.scene_encoding import KEY_RANGE, Sight, arms
+from apex_ompl.model.scene_encoding import KEY_RANGE, SceneEncoding, arms
 from apex_ompl.problems.objects import bar, two_cups
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.training.conditions import batch_queries
-from apex_ompl.training.mirror import Mirror
+from apex_ompl.training.conditions import EncodedPaths, batch_queries
+from apex_ompl.training.data import Mirror
 from apex_ompl.training.records import DatasetError, held_extents
-from apex_ompl.training.scene_data import SightTable
+from apex_ompl.training.scene_encoding import TorchSceneEncoding
 from apex_ompl.training.store import save
 from apex_ompl.training.torch_model import load_torch_model
-from apex_ompl.training.torch_scene_encoding import TorchSight
 from apex_ompl.training.training import Trainer
 
 ALONG = 3
@@ -46,16 +45,16 @@ ROWS = [
 
 
 @pytest.fixture(scope="module")
-def sight() -> Sight:
-    return Sight(keys(), Probes.from_robot(kernel().robot, ALONG), HANDS)
+def encoding() -> SceneEncoding:
+    return SceneEncoding(keys(), Probes.from_robot(kernel().robot, ALONG), HANDS)
 
 
-def test_arms_at_key_states_are_in_their_balls(sight: Sight) -> None:
+def test_arms_at_key_states_are_in_their_balls(encoding: SceneEncoding) -> None:
     """Clearances at key states are lower bounds of the kernel's, whose fingers are as far closed, and near to them."""
     tables, scene = kernel().robot, ObstacleSet.from_rows(ROWS).tables()
     assert [len(group) for group in arms(tables)] == [7, 7]
-    found = sight.at_keys(sight.balls(kernel()), scene, None).reshape(-1, 2) * KEY_RANGE
-    states = sight.keys.state.copy()
+    found = encoding.at_keys(encoding.balls(kernel()), scene, None).reshape(-1, 2) * KEY_RANGE
+    states = encoding.keys.state.copy()
     states[:, 14:] = 0.5 * (tables.arrays.lower + tables.arrays.upper)[14:]
     for side, joints in enumerate(((*range(7), 14), (*range(7, 14), 15))):
         exact = Kernel(tables.restricted_to(joints), scene).clearance(states)[:, 0]
@@ -72,12 +71,12 @@ def test_key_states_are_apart_and_survive_half_precision() -> None:
     assert ball.shape == (2, 7, 1 + PIECES, 4)
 
 
-def test_features_along_the_line_are_distances_of_the_probes(sight: Sight) -> None:
+def test_features_along_the_line_are_distances_of_the_probes(encoding: SceneEncoding) -> None:
     mine = query(3)
-    found = sight.features([mine], kernel())[0]
-    assert found.shape == (model_config(**CLEARANCES).seen,)
-    points = sight.probes.positions(kernel(), mine.start[None], mine.goal[None])[0].reshape(-1, 3)
-    scene, _ = mine.seen()
+    found = encoding.features([mine], kernel())[0]
+    assert found.shape == (model_config(**CLEARANCES).scene_features,)
+    points = encoding.probes.positions(kernel(), mine.start[None], mine.goal[None])[0].reshape(-1, 3)
+    scene, _ = mine.obstacle_tables()
     count, keyed = len(points), keys().state.shape[0] * 2
     distances = found[keyed + 3 * count : keyed + 4 * count] * MAX_DISTANCE
     slopes = found[keyed + 4 * count : keyed + 7 * count].reshape(-1, 3)
@@ -92,15 +91,15 @@ def test_features_along_the_line_are_distances_of_the_probes(sight: Sight) -> No
 
 def test_features_are_those_of_the_mirror_image() -> None:
     """But for the hands, which are not quite alike; arms change places, and y its sign."""
-    sight = Sight(keys(), Probes.from_robot(kernel().robot, ALONG), HANDS)
-    image = replace(sight.keys, state=MIRROR.states(sight.keys.state))
+    encoding = SceneEncoding(keys(), Probes.from_robot(kernel().robot, ALONG), HANDS)
+    image = replace(encoding.keys, state=MIRROR.states(encoding.keys.state))
     mine = replace(query(5), held=())
     flip = np.array([1.0, -1.0, 1.0])
     rows = [(s, tuple(flip * p), (-q[0], q[1], -q[2], q[3]), size) for s, p, q, size in ROWS]
     theirs = replace(mine, known=ObstacleSet.from_rows(rows), start=MIRROR.states(mine.start))
     theirs = replace(theirs, goal=MIRROR.states(mine.goal))
-    found = sight.features([replace(mine, known=ObstacleSet.from_rows(ROWS))], kernel())[0]
-    there = replace(sight, keys=image).features([theirs], kernel())[0]
+    found = encoding.features([replace(mine, known=ObstacleSet.from_rows(ROWS))], kernel())[0]
+    there = replace(encoding, keys=image).features([theirs], kernel())[0]
     keyed, points = 2 * len(keys().state), ALONG * 14
 
     def swapped(values: np.ndarray, width: int) -> np.ndarray:
@@ -116,7 +115,7 @@ def test_features_are_those_of_the_mirror_image() -> None:
     )
 
 
-def test_what_obstacles_are_made_of_does_not_matter(sight: Sight) -> None:
+def test_what_obstacles_are_made_of_does_not_matter(encoding: SceneEncoding) -> None:
     """A box as it is, in two halves, as a mesh, and as points on its surface, whose balls it is thinner by."""
     whole = Obstacle.model_validate({"name": "b", "box": (0.1, 0.7, 0.5), "position": (0.5, 0.1, 0.5)})
     halves = [
@@ -128,7 +127,7 @@ def test_what_obstacles_are_made_of_does_not_matter(sight: Sight) -> None:
     for scene in ([whole], halves):
         asked = make_query(CollisionChecker(robot(), scene), mine.start, mine.goal, point=False)
         assert asked.scene is not None and asked.scene[1].sum() == len(scene) < len(asked.scene[1]), "but for tables"
-        found.append(sight.features([asked], kernel())[0])
+        found.append(encoding.features([asked], kernel())[0])
     keyed, points = 2 * len(keys().state), ALONG * 14
     np.testing.assert_allclose(found[0][:keyed], found[1][:keyed], atol=0.35)  # the depth inside is another
     outside = found[0] > 0.05
@@ -136,7 +135,7 @@ def test_what_obstacles_are_made_of_does_not_matter(sight: Sight) -> None:
     np.testing.assert_allclose(found[0][outside], found[1][outside], atol=1e-6)
 
 
-def test_a_ball_is_seen_alike_as_a_mesh_and_as_points(sight: Sight, tmp_path: Path) -> None:
+def test_a_ball_is_seen_alike_as_a_mesh_and_as_points(encoding: SceneEncoding, tmp_path: Path) -> None:
     radius, middle, thick = 0.2, (0.5, 0.1, 0.6), 0.01
     vertices, faces = bumpy_sphere(24, radius, 0.0)
     lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a} {b} {c}" for a, b, c in faces + 1]
@@ -152,26 +151,26 @@ def test_a_ball_is_seen_alike_as_a_mesh_and_as_points(sight: Sight, tmp_path: Pa
     for shape in shapes:
         ball = Obstacle.model_validate({"name": "ball", "position": middle, **shape})
         asked = make_query(CollisionChecker(robot(), [ball]), mine.start, mine.goal, point=False)
-        found.append(sight.features([asked], kernel())[0][:keyed] * KEY_RANGE)
+        found.append(encoding.features([asked], kernel())[0][:keyed] * KEY_RANGE)
     outside = found[0] > 0.0
     assert outside.sum() > 10 and np.ptp(found[0]) > 0.1
     for other in found[1:]:
         assert np.abs(other - found[0])[outside].max() < 0.03 and np.median(np.abs(other - found[0])) < 0.01
 
 
-def test_features_of_a_table_are_those_of_queries(sight: Sight) -> None:
+def test_features_of_a_table_are_those_of_queries(encoding: SceneEncoding) -> None:
     paths = some_paths()
     with_images = [paths, MIRROR.paths(paths, kernel())]
     for some in with_images:
         which = np.random.default_rng(0).integers(len(some), size=40)
-        table = SightTable(some, TorchSight(sight, kernel(), torch.device("cpu")), None)
+        table = EncodedPaths(some, TorchSceneEncoding(encoding, kernel(), torch.device("cpu")), None)
         control, found = table.batch(torch.from_numpy(which), torch.Generator())
         np.testing.assert_allclose(control.numpy(), some.control(which), atol=1e-6)
         held = some.arrays["held"][some.arrays["problem"][which]]
         extents = [held_extents(some.names["held"][h]) for h in held]
         asked = [replace(query_from_path(some, int(k)), held=e) for k, e in zip(which, extents, strict=True)]
-        wanted = batch_queries(asked, sight, kernel())
-        np.testing.assert_allclose(found.seen.numpy(), wanted.seen.numpy(), atol=3e-4)
+        wanted = batch_queries(asked, encoding, kernel())
+        np.testing.assert_allclose(found.features.numpy(), wanted.features.numpy(), atol=3e-4)
         np.testing.assert_allclose(found.start.numpy(), wanted.start.numpy(), atol=1e-6)
 
 
@@ -205,7 +204,7 @@ def test_a_trained_model_is_read_by_both_and_plans(tmp_path: Path, refined: bool
     again = Trainer(settings, tmp_path / "run", HERE)
     assert again.step == 12, "it resumes: key states are the same"
     mine, theirs = (load(tmp_path / "run" / "checkpoint") for load in (load_model, load_torch_model))
-    assert isinstance(mine, ArrayModel) and mine.sight is not None
+    assert isinstance(mine, ArrayModel) and mine.scene_encoding is not None
     proposed = [m.propose(query(2), kernel(), 3).control for m in (mine, theirs)]
     np.testing.assert_allclose(*proposed, atol=3e-4)
     varied = [m.renoise(query(2), kernel(), proposed[0], 100).control for m in (mine, theirs)]

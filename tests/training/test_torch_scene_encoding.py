@@ -12,16 +12,14 @@ from models import DOF, HANDS, POST, REFINED, WALL, kernel, keys, network, query
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.point_distances import nearest_points
 from apex_ompl.model.query import ObstacleSet, Probes
-from apex_ompl.model.scene_encoding import REACH, Sight
-from apex_ompl.training.kernel_scene_encoding import CompiledSight
-from apex_ompl.training.obstacles import Obstacles
-from apex_ompl.training.scene_data import Augmentation, SightTable
+from apex_ompl.model.scene_encoding import REACH, SceneEncoding
+from apex_ompl.training.conditions import Augmentation, EncodedPaths
+from apex_ompl.training.scene_encoding import KernelSceneEncoding, Obstacles, TorchSceneEncoding
 from apex_ompl.training.torch_model import TorchModel
-from apex_ompl.training.torch_scene_encoding import TorchSight
 from apex_ompl.types import Array
 
 CPU = torch.device("cpu")
-SIGHT = Sight(keys(), Probes.from_robot(kernel().robot, 3), HANDS)
+ENCODING = SceneEncoding(keys(), Probes.from_robot(kernel().robot, 3), HANDS)
 
 
 def drawn(rng: np.random.Generator, count: int) -> ObstacleSet:
@@ -58,11 +56,11 @@ def test_nearest_obstacles_are_the_kernels(seed: int, counts: list[int]) -> None
 
 def test_joints_are_where_the_kernel_has_them() -> None:
     states = np.random.default_rng(0).uniform(kernel().robot.arrays.lower, kernel().robot.arrays.upper, (9, DOF))
-    eyes = TorchSight(SIGHT, kernel(), CPU)
+    encoding = TorchSceneEncoding(ENCODING, kernel(), CPU)
     paths = torch.tensor(states, dtype=torch.float32)[None]
-    centers, radii = eyes.arm_balls(paths)
+    centers, radii = encoding.arm_balls(paths)
     rotation, origin = kernel().joint_frames(states)
-    ball, joint = SIGHT.keys.ball[:, :, 1:], SIGHT.keys.joint
+    ball, joint = ENCODING.keys.ball[:, :, 1:], ENCODING.keys.joint
     wanted = np.einsum("nacij,acpj->nacpi", rotation[:, joint], ball[..., :3]) + origin[:, joint][:, :, :, None]
     np.testing.assert_allclose(centers.numpy().reshape(wanted.shape), wanted, atol=1e-5)
     np.testing.assert_allclose(radii.reshape(9, -1)[0], ball[..., 3].ravel(), atol=1e-6)
@@ -72,9 +70,13 @@ def test_features_along_paths_are_those_of_numpy() -> None:
     rng = np.random.default_rng(1)
     scenes = [ObstacleSet.from_rows([]), query(0).obstacles, drawn(rng, 8)]
     paths = np.stack([np.linspace(query(k).start, query(k).goal, 3) for k in range(3)])
-    found = TorchSight(SIGHT, kernel(), CPU).along(torch.tensor(paths, dtype=torch.float32), as_tensors(scenes))
+    found = TorchSceneEncoding(ENCODING, kernel(), CPU).along(
+        torch.tensor(paths, dtype=torch.float32), as_tensors(scenes)
+    )
     for row, path, scene in zip(found, paths, scenes, strict=True):
-        np.testing.assert_allclose(row.numpy(), SIGHT.along(kernel(), path[None], scene.tables(), None)[0], atol=2e-4)
+        np.testing.assert_allclose(
+            row.numpy(), ENCODING.along(kernel(), path[None], scene.tables(), None)[0], atol=2e-4
+        )
     pushed = found[:, -3 * DOF :].abs().amax(dim=1)
     assert pushed[2] > 0.1 and pushed[0] == 0.0
 
@@ -86,35 +88,35 @@ def test_what_the_kernel_sees_is_what_torch_sees() -> None:
     among, limits = as_tensors(scenes), kernel().robot.arrays
     states = rng.uniform(limits.lower, limits.upper, (4, 6, DOF))
     paths = torch.tensor(states, dtype=torch.float32)
-    eyes, wanted = CompiledSight(SIGHT, kernel(), CPU), TorchSight(SIGHT, kernel(), CPU)
-    balls = [one.arm_balls(paths) for one in (eyes, wanted)]
+    encoding, wanted = KernelSceneEncoding(ENCODING, kernel(), CPU), TorchSceneEncoding(ENCODING, kernel(), CPU)
+    balls = [one.arm_balls(paths) for one in (encoding, wanted)]
     for mine, theirs in zip(*balls, strict=True):
         torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(eyes.least(among, *balls[0]), wanted.least(among, *balls[1]), atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(eyes.at_keys(among).float(), wanted.at_keys(among).float(), atol=1e-3, rtol=0.0)
+    torch.testing.assert_close(encoding.least(among, *balls[0]), wanted.least(among, *balls[1]), atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(encoding.at_keys(among).float(), wanted.at_keys(among).float(), atol=1e-3, rtol=0.0)
     points = torch.tensor(rng.uniform(-0.8, 0.8, (4, 40, 3)), dtype=torch.float32)
-    near, far = eyes.nearest(among, points), wanted.nearest(among, points)
+    near, far = encoding.nearest(among, points), wanted.nearest(among, points)
     torch.testing.assert_close(near[0], far[0], atol=1e-5, rtol=0.0)
     assert ((near[1] - far[1]).abs().amax(dim=2) < 1e-3).float().mean() > 0.95, "but for points on edges"
     many, torch_threads = scenes * 200, torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        again = eyes.nearest(as_tensors(many), points.repeat(200, 1, 1))
+        again = encoding.nearest(as_tensors(many), points.repeat(200, 1, 1))
     finally:
         torch.set_num_threads(torch_threads)
     assert torch.equal(again[0], near[0].repeat(200, 1)) and torch.equal(again[1], near[1].repeat(200, 1, 1))
     lines = np.stack([np.linspace(query(k).start, query(k).goal, 3) for k in range(4)])
     paths = torch.tensor(lines, dtype=torch.float32)
-    apart = (eyes.along(paths, among) - wanted.along(paths, among)).abs()
+    apart = (encoding.along(paths, among) - wanted.along(paths, among)).abs()
     assert (apart < 1e-3).float().mean() > 0.97
     nothing = as_tensors([drawn(rng, 0), drawn(rng, 0)])
-    assert len(eyes.at_keys(nothing)) == len(eyes.least(nothing, balls[0][0][:2], balls[0][1])) == 0
-    assert (eyes.nearest(nothing, points[:2])[0] == 0.4).all()
+    assert len(encoding.at_keys(nothing)) == len(encoding.least(nothing, balls[0][0][:2], balls[0][1])) == 0
+    assert (encoding.nearest(nothing, points[:2])[0] == 0.4).all()
 
 
 def test_pushes_are_virtual_work() -> None:
     """The rate of a joint times its push is the power of the forces: f . dp/dq, by finite differences."""
-    probes, state = SIGHT.probes, query(4).start
+    probes, state = ENCODING.probes, query(4).start
     rng = np.random.default_rng(2)
 
     def points(q: Array) -> Array:
@@ -136,16 +138,16 @@ def test_what_collisions_cost_rises_as_its_gradient_says() -> None:
     rng, margin = np.random.default_rng(3), 0.05
     scenes, limits = [drawn(rng, n) for n in (6, 0, 3)], kernel().robot.arrays
     among, paths = as_tensors(scenes), rng.uniform(limits.lower, limits.upper, (3, 4, DOF))
-    for kind in (CompiledSight, TorchSight):
-        eyes = kind(SIGHT, kernel(), CPU)
+    for kind in (KernelSceneEncoding, TorchSceneEncoding):
+        encoding = kind(ENCODING, kernel(), CPU)
 
-        def cost(states: Array, eyes: TorchSight = eyes) -> tuple[Array, Array]:
-            found = eyes.collision_cost(torch.tensor(states, dtype=torch.float32), among, margin)
+        def cost(states: Array, encoding: TorchSceneEncoding = encoding) -> tuple[Array, Array]:
+            found = encoding.collision_cost(torch.tensor(states, dtype=torch.float32), among, margin)
             return found[0].double().numpy(), found[1].double().numpy()
 
         found, slope = cost(paths)
         assert found[0] > 0.1 and found[1] == 0.0 and not slope[1].any() and not slope[..., 14:].any()
-        centers, radii = eyes.arm_balls(torch.tensor(paths, dtype=torch.float32))
+        centers, radii = encoding.arm_balls(torch.tensor(paths, dtype=torch.float32))
         for k, scene in enumerate(scenes):
             d = nearest_points(scene.tables(), centers[k].double().numpy(), 1.0)[0] - radii.double().numpy()
             near = np.where(d < 0.0, margin / 2 - d, np.maximum(0.0, margin - d) ** 2 / (2 * margin))
@@ -161,11 +163,11 @@ def test_what_collisions_cost_rises_as_its_gradient_says() -> None:
 
 
 @pytest.fixture(scope="module")
-def varied() -> SightTable:
-    return SightTable(some_paths(), TorchSight(SIGHT, kernel(), CPU), Augmentation(0.6, 1.0))
+def varied() -> EncodedPaths:
+    return EncodedPaths(some_paths(), TorchSceneEncoding(ENCODING, kernel(), CPU), Augmentation(0.6, 1.0))
 
 
-def test_augmented_paths_are_free_among_their_obstacles(varied: SightTable) -> None:
+def test_augmented_paths_are_free_among_their_obstacles(varied: EncodedPaths) -> None:
     """Among those of another scene, too; a part is another curve than its path by less than a centimeter."""
     paths, robot = some_paths(), kernel().robot
     which = torch.arange(0, len(paths), len(paths) // 60)
@@ -185,7 +187,7 @@ def test_augmented_paths_are_free_among_their_obstacles(varied: SightTable) -> N
     assert min(clearances) > -0.02 and np.mean(np.array(clearances) > 0.0) > 0.9
 
 
-def test_parts_are_on_their_paths_and_paths_turn_round(varied: SightTable) -> None:
+def test_parts_are_on_their_paths_and_paths_turn_round(varied: EncodedPaths) -> None:
     paths, which = some_paths(), torch.arange(0, 600, 3)
     control, conditions = varied.batch(which, torch.Generator().manual_seed(1))
     assert torch.equal(control[:, 0], conditions.start)
@@ -206,10 +208,10 @@ def test_parts_are_on_their_paths_and_paths_turn_round(varied: SightTable) -> No
     assert min(whole, turned, parts) > 20
 
 
-def test_the_same_generator_gives_the_same_batch(varied: SightTable) -> None:
+def test_the_same_generator_gives_the_same_batch(varied: EncodedPaths) -> None:
     which = torch.arange(40)
     first, second, other = (varied.batch(which, torch.Generator().manual_seed(k)) for k in (3, 3, 4))
-    assert torch.equal(first[0], second[0]) and torch.equal(first[1].seen, second[1].seen)
+    assert torch.equal(first[0], second[0]) and torch.equal(first[1].features, second[1].features)
     assert not torch.equal(first[0], other[0])
 
 

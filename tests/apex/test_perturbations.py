@@ -1,4 +1,4 @@
-"""APEX for robots that no model ships for: random bumps in the place of proposals."""
+"""APEX for robots without a shipped model: random perturbations of straight lines instead of proposals."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from planning import HARD, cached_problem
 from support import ROOT
 
 from apex_ompl import plan, run
-from apex_ompl.apex.bumps import BumpModel
 from apex_ompl.apex.models import has_model, trajectory_model
+from apex_ompl.apex.perturbations import PerturbationModel
 from apex_ompl.apex.query import make_query
 from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
@@ -25,8 +25,10 @@ BAXTER = ROOT / "examples" / "baxter_table.yaml"
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 999), count=st.integers(1, 5), temperature=st.floats(0.1, 3.0))
-def test_bumps_join_the_ends_within_the_limits(baxter: Robot, seed: int, count: int, temperature: float) -> None:
-    model, checker, rng = BumpModel(), CollisionChecker(baxter), np.random.default_rng(seed)
+def test_perturbed_lines_join_the_ends_within_the_limits(
+    baxter: Robot, seed: int, count: int, temperature: float
+) -> None:
+    model, checker, rng = PerturbationModel(), CollisionChecker(baxter), np.random.default_rng(seed)
     limits = baxter.limits
     ends = rng.uniform(limits.lower, limits.upper, (2, 2, baxter.dof))
     queries = [make_query(checker, start, goal, point=False) for start, goal in ends]
@@ -45,8 +47,8 @@ def test_bumps_join_the_ends_within_the_limits(baxter: Robot, seed: int, count: 
     assert other.shape == made[0][:1].shape and not np.array_equal(other, made[0][:1])
 
 
-def test_bumps_are_larger_at_higher_temperature(baxter: Robot) -> None:
-    model, checker = BumpModel(), CollisionChecker(baxter)
+def test_perturbations_are_larger_at_higher_temperature(baxter: Robot) -> None:
+    model, checker = PerturbationModel(), CollisionChecker(baxter)
     query = make_query(checker, baxter.home, baxter.home, point=False)
     off = [
         np.abs(
@@ -59,8 +61,8 @@ def test_bumps_are_larger_at_higher_temperature(baxter: Robot) -> None:
 
 def test_what_proposes_for_a_robot() -> None:
     assert has_model("dual_panda_softhand") and not has_model("baxter")
-    assert isinstance(trajectory_model("auto", "baxter"), BumpModel)
-    assert isinstance(trajectory_model("none", "dual_panda_softhand"), BumpModel)
+    assert isinstance(trajectory_model("auto", "baxter"), PerturbationModel)
+    assert isinstance(trajectory_model("none", "dual_panda_softhand"), PerturbationModel)
     assert isinstance(trajectory_model("auto", "dual_panda_softhand"), TrajectoryModel)
     with pytest.raises(FileFormatError, match="expected 'baxter'"):
         trajectory_model("apex", "baxter")
