@@ -28,10 +28,10 @@ LEAST_SPEED = 0.02  # of a hand that a cube appears before [m/s]
 PLANNED_CLEARANCE, CLEARANCE = (
     0.08,
     0.04,
-)  # of the robot to a cube when it appears: as it is drawn, and least; of ``interceptor`` at the begin [m]
+)  # of the robot to a cube when it appears: as it is drawn, and least; of ``interceptor`` at the start [m]
 LEAST_HEADING = 0.02  # way of a cube that moves to where the hand is going [m]
 GOAL_CLEARANCE = 0.03  # of a cube that stands to the goal [m]
-LEADS = (0.4, 1.5)  # between the begin of the first motion and its meeting with a cube [s]
+LEADS = (0.4, 1.5)  # between the start of the first motion and its meeting with a cube [s]
 
 
 class AmbushEnvironment(ScriptedEnvironment):
@@ -57,7 +57,7 @@ class AmbushEnvironment(ScriptedEnvironment):
         return self._robot.balls(q).clearance(place, self._edge) >= gap
 
     def _make(self, place: Array, velocity: Array, time: float) -> None:
-        """Make the cube at a place, shape (3,) [m], and at a time [s]; from then on all is decided."""
+        """Make the cube at a place, shape (3,) [m], and at a time [s], which fixes its motion."""
         made = cube("cube_0", self._edge, place - time * velocity, velocity)
         self._obstacles, self.foreseen = (made.model_copy(update={"appears": float(time)}),), math.inf
 
@@ -76,7 +76,7 @@ class PopupEnvironment(AmbushEnvironment):
         self._planned: tuple[float, Array, Array] | None = None
 
     def start(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s]: decide when and where the cube will come into being.
+        """Take the first motion, and when it starts [s]: decide when and where the cube will come into being.
 
         Raises:
             ParameterError: The time is before the last step.
@@ -131,9 +131,9 @@ class PopupEnvironment(AmbushEnvironment):
 
 
 class InterceptorEnvironment(AmbushEnvironment):
-    """A cube at constant velocity would meet a hand .4 to 1.5 s behind the begin of the first motion.
+    """A cube at constant velocity would meet a hand .4 to 1.5 s after the start of the first motion.
 
-    It is there from that begin on, clear of the robot then, and its front face comes to where the motion has the hand,
+    It is there from that start on, clear of the robot then, and its front face comes to where the motion has the hand,
     at its end if it ends before.
     """
 
@@ -142,7 +142,7 @@ class InterceptorEnvironment(AmbushEnvironment):
         super().__init__(name, problem, edge, rng, float(rng.uniform(*SPEEDS)))
 
     def start(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s]: the cube is there from then on.
+        """Take the first motion, and when it starts [s]: the cube exists afterwards.
 
         Raises:
             ParameterError: The time is before the last step.

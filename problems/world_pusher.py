@@ -20,7 +20,7 @@ from apex_ompl.types import Array
 
 SPEED = 0.15  # [m/s]
 STAYS = 3.0  # from when it sets out to when it turns back [s]
-WAITS = (0.0, 1.0)  # behind the begin of the first motion, before it sets out [s]
+WAITS = (0.0, 1.0)  # after the start of the first motion, before it starts [s]
 PERIOD = 0.1  # least time between two of its decisions [s]
 GAPS = (0.25, 0.4)  # to the robot at the start, from outside [m]
 SIDE = math.radians(70.0)  # largest angle between the direction that it comes from and the front
@@ -56,7 +56,7 @@ class PusherEnvironment(ScriptedEnvironment):
         self._wait, self._sets_out, self._decided = float(rng.uniform(*WAITS)), math.inf, -math.inf
 
     def start(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s].
+        """Take the first motion, and when it starts [s].
 
         Raises:
             ParameterError: The time is before the last step.

@@ -1,4 +1,4 @@
-"""Worlds whose obstacles move by records of the scene: fixed from the beginning, or made when the robot sets out."""
+"""Environments whose obstacles move by records of the scene: fixed from the start, or made when the robot starts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from apex_ompl.util.validation import check_number
 
 
 class ScriptedEnvironment(DynamicEnvironment):
-    """A world of obstacles with a velocity or a script.
+    """An environment of obstacles with a velocity or a script.
 
     Attributes:
         foreseen: Time up to which ``present`` may be asked, besides the last step [s]; infinite where all is fixed.
@@ -24,20 +24,20 @@ class ScriptedEnvironment(DynamicEnvironment):
     foreseen: float = math.inf
 
     def __init__(self, name: str, problem: Problem, obstacles: tuple[Obstacle, ...], fastest: float) -> None:
-        """Make a world.
+        """Make an environment.
 
         Args:
             name: Its name.
-            problem: What stands still.
-            obstacles: What moves, from time 0 on.
-            fastest: Largest speed that there will be [m/s].
+            problem: Static obstacles, start and goal.
+            obstacles: Moving obstacles, from time 0 on.
+            fastest: Their largest speed [m/s].
         """
         self.name, self.problem, self.fastest = name, problem, fastest
         self._obstacles = obstacles
         self._now = 0.0
 
     def start(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s].
+        """Take the first motion, and when it starts [s].
 
         Raises:
             ParameterError: The time is before the last step.
@@ -74,9 +74,9 @@ class ScriptedEnvironment(DynamicEnvironment):
 
 
 def environment_of(problem: Problem) -> ScriptedEnvironment:
-    """Return the world of a problem's own obstacles, which do what their records say whatever the robot does.
+    """Return the environment of a problem's own obstacles, which move by their records whatever the robot does.
 
-    Obstacles with a velocity go on for ever.
+    Obstacles with a velocity move for ever.
 
     Raises:
         ParameterError: A pair of bodies that may touch names an obstacle that moves.

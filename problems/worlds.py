@@ -8,7 +8,7 @@ into those for training, validation and tests as the suites' are.
 
 - ``moving``: obstacles do what their problem says, whatever the robot does.
 - ``popup``: a cube comes into being before a hand during the first motion (:mod:`apex_ompl.problems.world_ambushes`).
-- ``interceptor``: a cube at constant velocity is to meet the first motion (the same module).
+- ``interceptor``: a cube at constant velocity would meet the first motion (the same module).
 - ``turning``: a cube takes a new direction every .5 to 2 s (:mod:`apex_ompl.problems.world_wanderers`).
 - ``crowd``: three cubes cross in front of the robot (the same module).
 - ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_pusher`).
@@ -42,14 +42,14 @@ SEED = re.compile(r"0|[1-9][0-9]{0,19}")
 
 
 class DynamicEnvironment(ABC):
-    """What truly happens in a run.
+    """What the obstacles of a run truly do.
 
     A run calls ``start`` once, when its first motion is committed, and ``advance`` at every step of its clock, with
     times that increase from 0; ``present`` may be asked about any time up to the last step.
 
     Attributes:
         name: Its name, such as ``popup/12``.
-        problem: What stands still, start and goal, and what is held.
+        problem: Static obstacles, start and goal, and held objects.
         fastest: Largest speed of its obstacles [m/s].
         ran: Whether a run was made in it: each is good for one.
     """
@@ -64,7 +64,7 @@ class DynamicEnvironment(ABC):
         return one_line(type(self).__name__, repr(self.name), "ran" if self.ran else "")
 
     def start(self, motion: Trajectory, time: float) -> None:  # noqa: B027 - most worlds do not care
-        """Take the first motion that the robot is to follow, and when it begins [s]."""
+        """Take the first motion that the robot will follow, and when it starts [s]."""
 
     def advance(self, time: float, q: Array) -> None:  # noqa: B027
         """Take the robot's state, shape (dof,), at a time [s]."""

@@ -1,4 +1,4 @@
-"""Gaussian-process prior of motions whose acceleration is white noise: constant velocity, but for noise.
+"""Gaussian-process prior of motions with white noise on the acceleration (constant velocity without noise).
 
 The state x = (q, v) of a joint follows the linear stochastic differential equation
 
