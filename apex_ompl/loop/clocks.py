@@ -143,10 +143,10 @@ def run_in_real_time(
                     k = math.floor(seen / period)
                     before, then = Decided.of(executor), (k + 1) * period
                 loop.advance(k * period)
-                looked = time.perf_counter()
+                observed = time.perf_counter()
                 loop.observe(k * period)
                 ended = loop.step(then)
-                ticks.append(time.perf_counter() - looked)
+                ticks.append(time.perf_counter() - observed)
                 k += 1
                 if ended is None and time.perf_counter() - started > then:
                     undo(executor, then, before)

@@ -199,8 +199,12 @@ class Loop:
         trajectory, reason = executed(self.executor.followed, now), self._aborted
         if not reached and not reason:
             awaited = f"never seen: {', '.join(sorted(self._tracker.awaited))}" if self._tracker.awaited else ""
-            blind = "no look was of use in the end" if self.executor.blind(now) else ""
-            last = f"{self._refused} looks were refused, the last one since {self._refusal}" if self._refused else ""
+            blind = "no observation was usable in the end" if self.executor.blind(now) else ""
+            last = (
+                f"{self._refused} observations were refused, the last one since {self._refusal}"
+                if self._refused
+                else ""
+            )
             reason = "; ".join(filter(None, (awaited, blind, last)))
         return RunRecord(
             trajectory, tuple(self.executor.events), reached, why, self._broken, reason=reason,

@@ -52,7 +52,7 @@ def run_in(
         raise ParameterError("settings", settings, "a LoopSettings")
     replanning = method_of(method)
     if environment.ran:
-        raise ParameterError("problem", environment.name, "an environment that no run was made in: load it anew")
+        raise ParameterError("problem", environment.name, "an environment without a run so far: load it again")
     sensor = sensor or Sensor(seed=seed)
     settings = (settings or LoopSettings()).completed(sensor.largest_error, environment.fastest)
     used = replace(replace(settings, prediction=prediction), **replanning.settings)
@@ -138,14 +138,15 @@ class _Run:
             outcome = Outcome.MISALIGNED if done.reached else ended[done.ended]
             if not done.reached:
                 time = done.trajectory.duration
-                said = [done.reason] if done.reason else []
-                reason = "; ".join([f"no goal was reached in {time:.3g} s{self.blocked(time)}", *said])
-        told = [
+                reason = "; ".join(
+                    [f"no goal was reached in {time:.3g} s{self.blocked(time)}", *filter(None, [done.reason])]
+                )
+        contacts = [
             Event(one.time, "contact", {"first": one.first, "second": one.second, "moved": one.moved})
             for one in {report.contact, report.moving_contact}
             if one is not None
         ]
-        done = replace(done, events=tuple(sorted((*done.events, *told), key=lambda event: event.time)))
+        done = replace(done, events=tuple(sorted((*done.events, *contacts), key=lambda event: event.time)))
         return self.result(done, outcome, reason, report.clearance)
 
     def blocked(self, time: float) -> str:

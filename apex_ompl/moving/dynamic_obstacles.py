@@ -97,7 +97,7 @@ class DynamicObstacles:
         return {name: value for name, value in self.__dict__.items() if name != "arrays"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take a state, and make the views anew."""
+        """Restore a state, and the views of its arrays."""
         self.__dict__.update(state)
         self._pack(self.packed)
 

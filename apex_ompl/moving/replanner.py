@@ -20,7 +20,7 @@ SAME_STATE = 1e-7  # largest jump of positions, velocities and accelerations whe
 
 @dataclass(frozen=True, eq=False)
 class Request:
-    """What a replan is asked for.
+    """A request for a replan.
 
     Attributes:
         number: Number of the request in its run; seeds random choices.
@@ -56,7 +56,7 @@ class Request:
 
     @property
     def hastens(self) -> bool:
-        """Whether what the robot follows leads to a goal without a conflict, so that only a faster motion is of use."""
+        """Whether the motion leads to a goal without a conflict, so that only a faster one is useful."""
         return self.following.to_goal and not math.isfinite(self.conflict)
 
     @property
@@ -77,7 +77,7 @@ class Request:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a replan found.
+    """The answer of a replanner.
 
     Attributes:
         found: The motion from the time of joining on, or None.
@@ -101,7 +101,7 @@ class Replanner(Protocol):
 
 
 ONE_PLAN: Mapping[str, Any] = {"hastens": False}
-"""Settings of a replanner that looks for no faster motion while the robot follows one without a conflict."""
+"""Settings of a replanner that seeks no faster motion while the robot follows one without a conflict."""
 FROM_REST: Mapping[str, Any] = {"from_rest": True, **ONE_PLAN}
 """Settings of a replanner that plans from rest only."""
 UNGUARDED: Mapping[str, Any] = {"prediction": "still", "guarded": False, **ONE_PLAN}

@@ -1,7 +1,7 @@
 """Retiming: speed along a known path among dynamic obstacles, and the safe intervals of time along it.
 
-The path keeps its shape, and time along it is chosen anew (path-velocity decomposition, Kant and Zucker 1986; LaValle
-2006, section 7.1.3), among safe intervals of time (Phillips and Likhachev 2011).
+The path keeps its shape, and only the speed along it is chosen (path-velocity decomposition, Kant and Zucker 1986;
+LaValle 2006, section 7.1.3), among safe intervals of time (Phillips and Likhachev 2011).
 """
 
 from __future__ import annotations
@@ -239,9 +239,9 @@ class _Search:
     def _starts(self, longest: float) -> list[float]:
         """Return places at which the rate may start to change, the latest first, where the motion has room to do so."""
         places = np.linspace(0.0, max(longest, 0.0), HEADS) + self.time
-        looked = places[:, None] + SPACINGS[0] * np.arange(LEAD)
-        use = np.abs(self.motion(looked.ravel(), 2)) / self.limits.acceleration
-        easy = use.max(axis=1).reshape(looked.shape).max(axis=1) <= EASY
+        near = places[:, None] + SPACINGS[0] * np.arange(LEAD)
+        use = np.abs(self.motion(near.ravel(), 2)) / self.limits.acceleration
+        easy = use.max(axis=1).reshape(near.shape).max(axis=1) <= EASY
         return list(dict.fromkeys([*places[easy][::-1].tolist()[:2], float(places[-1]), self.time]))
 
     def _places(self, profile: Profile, start: float, h: float, window: float) -> Array:

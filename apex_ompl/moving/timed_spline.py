@@ -177,7 +177,7 @@ class MotionOptimizer:
             clock: Time of the dynamic obstacles' stamps when it starts [s].
             steps: Most steps; by default the settings'.
             enough: The steps end when the clearances at the samples reach this [m].
-            damping: Of the first step; by default the settings'. The report has that to go on with.
+            damping: Damping of the first step; by default the settings'. The report has that of the next one.
 
         Raises:
             ParameterError: Control points of another shape.

@@ -117,7 +117,7 @@ def test_the_filter_knows_how_much_a_sensor_errs() -> None:
 def test_a_world_is_for_one_run() -> None:
     world = world_of(PROBLEM)
     run(world, "no-network")
-    with pytest.raises(ParameterError, match="load it anew"):
+    with pytest.raises(ParameterError, match="load it again"):
         run(world, "no-network")
 
 
@@ -155,7 +155,7 @@ def nowhere(k: int, one: Observation) -> Observation:
 def test_a_robot_does_not_start_before_it_has_seen_what_is_there() -> None:
     assert seen_by(Changed(lambda k, one: one)).reached
     for change, words in (
-        (nowhere, "looks were refused, the last one since the place of near is not finite"),
+        (nowhere, "observations were refused, the last one since the place of near is not finite"),
         (lambda k, one: replace(one, seen=()), "never seen: near"),
     ):
         done = seen_by(Changed(change))
@@ -175,7 +175,7 @@ def test_a_robot_stops_where_there_is_no_look_of_use_for_too_long() -> None:
     """As when a camera is unplugged under way."""
     silent = Changed(lambda k, one: nowhere(k, one) if k > WATCHED + 3 else one)
     done = seen_by(silent, silence=0.2, timeout=2.0)
-    assert not done.reached and "no look was of use in the end" in done.reason
+    assert not done.reached and "no observation was usable in the end" in done.reason
     blind = next(event for event in done.events if event.kind == "blind")
     assert blind.time - blind.data["last"] == pytest.approx(0.2, abs=0.02)
     assert is_at_rest(done.trajectory, blind.time + 0.5) and not is_at_rest(done.trajectory, blind.time)

@@ -24,8 +24,8 @@ from apex_ompl.types import Array, Flags
 
 NAME = "damon"
 Status = ob.PlannerStatus
-DEEP = 0.03  # overlap of spheres beyond which a node counts as in contact without a look at exact shapes [m]
-SEEN = 0.001  # clearances beyond this are not told apart [m]
+DEEP = 0.03  # overlap of spheres beyond which a node counts as in contact without a check by exact shapes [m]
+SEEN = 0.001  # largest clearance that is computed [m]
 
 
 class DAMON(OwnPlanner):

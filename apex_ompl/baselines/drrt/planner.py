@@ -61,7 +61,7 @@ class DRRT(OwnPlanner):
         self._solves, self._trimmed = 0, None
 
     def clearQuery(self) -> None:  # noqa: N802 - OMPL's name
-        """Keep the tree, which is of use as long as the goals are the same."""
+        """Keep the tree, which stays useful as long as the goals are the same."""
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.removed = 0

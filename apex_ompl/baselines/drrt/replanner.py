@@ -18,9 +18,9 @@ from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.resolution import SEARCH_RESOLUTION
 
-DEEP = 0.03  # overlap of spheres beyond which a state counts as in contact without a look at exact shapes [m]
+DEEP = 0.03  # overlap of spheres beyond which a state counts as in contact without a check by exact shapes [m]
 DEVIATION = 0.02  # of the motion from the path [rad]
-SEEN = 0.01  # clearances beyond this are not told apart [m]
+SEEN = 0.01  # largest clearance that is computed [m]
 
 
 @dataclass(eq=False)

@@ -120,7 +120,7 @@ class ImitationPlanner(OwnPlanner):
         return found or ("" if self.validator.accepts(states, stop) else NOT_ACCEPTED)
 
     def _rolled(self, start: Array, goal: Array, stop: Callable[[], bool]) -> Array | None:
-        """Return the path of the policy, shape (N, dof), or None where it was told to stop."""
+        """Return the path of the policy, shape (N, dof), or None where it was stopped."""
         checker, parameters = self.validator.checker, self.parameters
         query = make_query(checker, start, goal, point=self.policy.sees_point)
         kernel = checker.kernel.within(*bounds_of(self.getSpaceInformation(), checker.robot))

@@ -77,7 +77,7 @@ class ImitationPolicy:
             stop: Asked before each chunk whether to give up.
 
         Returns:
-            The paths, whose first states are the starts bit for bit; None where it was told to stop.
+            The paths, whose first states are the starts bit for bit; None where it was stopped.
         """
         executed = self.executed if executed is None else executed
         last = self.clock - 1 if steps is None else min(first_step + steps, self.clock - 1)

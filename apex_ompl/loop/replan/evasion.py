@@ -63,12 +63,12 @@ def step_aside(search: Search, *, proved: bool = False) -> Trajectory | None:
     for turn in range(ASCENTS + 1):
         states = np.clip(states, limits.lower, limits.upper)
         states[:, context.fingers] = q[context.fingers]
-        clear, slopes = _looked(search, states, looks)
+        clear, slopes = _clearances(search, states, looks)
         if turn < ASCENTS:  # away from what comes nearest
             slope = slopes[rows, clear.argmin(axis=1)]
             states = states + STRIDE * slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-6)
     back = _back(search)
-    states, clear = np.concatenate([states, back]), np.concatenate([clear, _looked(search, back, looks)[0]])
+    states, clear = np.concatenate([states, back]), np.concatenate([clear, _clearances(search, back, looks)[0]])
     near = np.minimum(clear.min(axis=1), context.kernel.clearance(states, SEEN).min(axis=1))
     search.budget.spend("clearance in time", len(states))
     size = np.abs(states - q).max(axis=1)
@@ -102,7 +102,7 @@ def _to(search: Search, state: Array) -> Trajectory | None:
     return time_path(states, search.context.limits, search.context.names).trajectory
 
 
-def _looked(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
+def _clearances(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
     """Return clearances of states at some times [m], and their gradients.
 
     Where steps aside must be proved, the last column is the clearance to the reachable sets at the first time.

@@ -229,8 +229,8 @@ class Sprint:
         trees = TreePair(self._checker.kernel, start[None], goals, self.longest, SEARCH_RESOLUTION, search.rng)
         for _ in range(0, self.most, BATCH):
             path = trees.grow(BATCH)
-            looked = trees.take_counts()
-            search.budget.spend(WORK, looked.proved + looked.blocked + looked.intervals)
+            counts = trees.take_counts()
+            search.budget.spend(WORK, counts.proved + counts.blocked + counts.intervals)
             if path is not None:
                 states = resample(path, STATES)
                 yield InitialMotion(states, path[-1], shortest_duration(states, search.context.limits))
