@@ -200,12 +200,8 @@ class Loop:
         if not reached and not reason:
             awaited = f"never seen: {', '.join(sorted(self._tracker.awaited))}" if self._tracker.awaited else ""
             blind = "no observation was usable in the end" if self.executor.blind(now) else ""
-            last = (
-                f"{self._refused} observations were refused, the last one since {self._refusal}"
-                if self._refused
-                else ""
-            )
-            reason = "; ".join(filter(None, (awaited, blind, last)))
+            refused = f"{self._refused} observations were refused, the last one since {self._refusal}"
+            reason = "; ".join(filter(None, (awaited, blind, refused if self._refused else "")))
         return RunRecord(
             trajectory, tuple(self.executor.events), reached, why, self._broken, reason=reason,
             unguarded=self.executor.unguarded, refused=self._refused, doubted=self._doubted,

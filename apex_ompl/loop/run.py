@@ -138,9 +138,8 @@ class _Run:
             outcome = Outcome.MISALIGNED if done.reached else ended[done.ended]
             if not done.reached:
                 time = done.trajectory.duration
-                reason = "; ".join(
-                    [f"no goal was reached in {time:.3g} s{self.blocked(time)}", *filter(None, [done.reason])]
-                )
+                missed = f"no goal was reached in {time:.3g} s{self.blocked(time)}"
+                reason = "; ".join(filter(None, (missed, done.reason)))
         contacts = [
             Event(one.time, "contact", {"first": one.first, "second": one.second, "moved": one.moved})
             for one in {report.contact, report.moving_contact}
