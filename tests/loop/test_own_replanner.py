@@ -1,4 +1,4 @@
-"""Replanners given as objects, and what the loop imports."""
+"""Replanners and environments given as objects, and what the loop imports."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ import subprocess
 import sys
 from importlib.util import module_from_spec, spec_from_file_location
 
+import numpy as np
 import pytest
 from support import ROOT
 
-from apex_ompl import run
+from apex_ompl import problems, run
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import Outcome
 from apex_ompl.moving import Answer, ComputeBudget, Request, RunContext
 from apex_ompl.moving.replanner import REGISTRY, register
 from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import obstacle_at
+from apex_ompl.timing import Trajectory
 
 EXAMPLE = ROOT / "examples" / "05_own_replanner.py"
 WORLD = "turning/vertical/medium/800001"
@@ -68,6 +72,37 @@ def test_a_replanner_is_known_by_the_name_that_it_is_registered_by() -> None:
         assert found.method == "idle" and found.settings["loop"]["evade"] == "never"
     finally:
         del REGISTRY["idle"]
+
+
+class OneBall:
+    """An environment of the user's own: a ball that passes far from the robot."""
+
+    def __init__(self) -> None:
+        self.name, self.problem, self.fastest, self.ran = "one ball", problems.load("vertical/free/1"), 0.1, False
+        self.ball = Obstacle(name="ball", sphere={"radius": 0.05}, position=(2.0, 0.0, 1.0), velocity=(0.0, 0.1, 0.0))
+        self.started: list[float] = []
+        self.times: list[float] = []
+
+    def start(self, motion: Trajectory, time: float) -> None:
+        self.started.append(time)
+
+    def advance(self, time: float, q: np.ndarray) -> None:
+        self.times.append(time)
+
+    def present(self, time: float) -> tuple[Obstacle, ...]:
+        return (obstacle_at(self.ball, time),)
+
+    def script(self) -> tuple[Obstacle, ...]:
+        return (self.ball,)
+
+
+def test_an_environment_of_the_users_own_is_run_in_once() -> None:
+    one = OneBall()
+    found = run(one, "no-network")
+    assert found.outcome is Outcome.REACHED and found.problem.name == "one ball" and "ball" in found.problem.moving
+    assert one.ran and len(one.started) == 1 and one.times == sorted(one.times)
+    with pytest.raises(ParameterError, match="load it again"):
+        run(one, "no-network")
 
 
 def test_what_is_no_replanner_is_named() -> None:
