@@ -13,7 +13,8 @@ from apex_ompl import planners, problems
 from apex_ompl.apex.parameters import NAME
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.planning import check_arguments, kept_planner
+from apex_ompl.planners import AnyPlanner
+from apex_ompl.planning.planner import check_arguments, kept_planner
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
@@ -54,7 +55,7 @@ def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
     """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
 
     Space, checker, motion validator, start and goals are set, and the default planner is allocated unless another one
-    is set. Moving obstacles stand where they are at time 0.
+    is set. Dynamic obstacles stand where they are at time 0.
 
     Raises:
         ApexError: The problem is unknown or faulty.
@@ -68,7 +69,7 @@ def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
 
 def plan(
     problem: Problem | str | os.PathLike[str],
-    planner: str | None = None,
+    planner: AnyPlanner | None = None,
     *,
     timeout: float = 5.0,
     seed: int = 0,
@@ -86,7 +87,8 @@ def plan(
 
     Args:
         problem: A problem, its name, or its file.
-        planner: Name of a planner, see ``apex_ompl.planners.names()``; by default apex, which does without a
+        planner: Name of a planner, see ``apex_ompl.planners.names()``, its parameters, or a function that makes one for
+            OMPL's space information, such as ``lambda si: APEX(si, stages=...)``; by default apex, which does without a
             network for a robot that no model ships for.
         timeout: Seconds for all that follows the set-up of problem and planner. The search ends a tenth of it before,
             from 0.05 to 0.5 s and at most half of it, so that its path can be proved and timed.
@@ -95,8 +97,8 @@ def plan(
             seeds one generator per process).
         simplify: Whether to shorten the path that was found.
         params: Parameters of the planner by name.
-        snapshot: Take moving obstacles to stand where they are at time 0. Otherwise the motion is planned in time, and
-            proved apart from where they are then (:mod:`apex_ompl.planning.among_dynamic_obstacles`).
+        snapshot: Take dynamic obstacles to stand where they are at time 0. Otherwise the motion is planned and proved
+            in time (:mod:`apex_ompl.planning.among_dynamic_obstacles`).
         timing: How the path is timed, or whether; the timed motion is proved too.
         leave_contact: Depth of contacts at the start that the path may leave along growing clearance, up to 0.001 [m];
             a note says so, since that way out is not proved.
@@ -110,7 +112,7 @@ def plan(
     """
     check_arguments(timeout, seed)
     if planner is not None:
-        planners.parameters(planner, **planners.named(params))  # before the problem is read
+        planners.chosen(planner, params)  # before the problem is read
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
     with kept_planner(loaded.robot) as kept:
         return kept.plan_problem(

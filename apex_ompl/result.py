@@ -34,9 +34,9 @@ NUMBERS = ("length", "deviation", *PROOF)
 
 
 INSIDE = "solve: "
-"""Stands before the names of a planner's own stages in ``PlanResult.times``."""
+"""Prefix of the names of a planner's own stages in ``PlanResult.times``."""
 FIRST = INSIDE + "first"
-"""Names the time from the beginning of ``solve`` to the first valid path there, of planners that tell it."""
+"""Name of the time from the start of ``solve`` to the first valid path, for planners that report it."""
 
 
 class PlanStatus(StrEnum):
@@ -93,12 +93,12 @@ class PlanResult:
         proved_by_spheres: Share of the path's length that sphere covers proved; exact shapes proved the rest.
         checks: Number of states checked one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
-            ``apex_ompl.ompl.report.SolveReport``), with ``+repair`` where a stretch of it failed the full check
+            ``apex_ompl.ompl.own_planner.SolveReport``), with ``+repair`` where a stretch of it failed the full check
             and was planned anew; ``straight line`` where that is a solution, so that no planner ran; empty without a
             path.
-        notes: What a user should know about this run, such as a snapshot of moving obstacles.
-        dynamic_obstacles: Names of the moving obstacles that ``trajectory`` was proved apart from, where they are in
-            time when it begins at time 0; ``path`` and the clearances are those among what stands still.
+        notes: Notes for the user, such as on a snapshot of dynamic obstacles.
+        dynamic_obstacles: Names of the dynamic obstacles that ``trajectory``, started at time 0, was proved clear of;
+            ``path`` and the clearances are those among the static obstacles.
     """
 
     status: PlanStatus

@@ -14,7 +14,7 @@ from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.simplify import simplify
-from apex_ompl.ompl.space import array_to_path, await_goal, path_to_array
+from apex_ompl.ompl.space import await_goal, path_to_array
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.paths.path import Path
@@ -22,7 +22,7 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 
 NAME = "rrtconnect+polish"
-TRIES = 3  # of cutting a path short that another checker accepts
+TRIES = 3  # of shortening, until another checker accepts the path
 
 
 def polished(
@@ -47,7 +47,7 @@ class PolishedRRTConnect(OwnPlanner):
 
     Attributes:
         validator: Decides what is valid.
-        report: What the last call of ``solve`` did.
+        report: Report on the last call of ``solve``.
     """
 
     def __init__(
@@ -59,10 +59,9 @@ class PolishedRRTConnect(OwnPlanner):
         self.validator = validator
         self._optimizer = optimizer
         self._inner = inner
-        self._begin = 0.0
 
     def clear(self) -> None:
-        """Forget what was found."""
+        """Forget the last solution."""
         super().clear()
         self._inner.clear()
 
@@ -70,12 +69,12 @@ class PolishedRRTConnect(OwnPlanner):
         self.validator = self.validator.current()
         si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
         self._inner.setProblemDefinition(pdef)
-        begin = self._begin = time.perf_counter()
+        started = time.perf_counter()
         await_goal(pdef.getGoal(), ptc)
         with self.report.timed("rrtconnect"):
             status = self._inner.solve(ptc)
         if status.getStatus() == ob.PlannerStatus.EXACT_SOLUTION:
-            self.report.solved_by, self.report.first = NAME, time.perf_counter() - begin
+            self.report.solved_by, self.report.first = NAME, time.perf_counter() - started
         if status.getStatus() != ob.PlannerStatus.EXACT_SOLUTION or ptc():
             return status.getStatus()
         dof = self.validator.checker.robot.dof
@@ -83,27 +82,20 @@ class PolishedRRTConnect(OwnPlanner):
         with self.report.timed("simplify"):
             for _ in range(TRIES):
                 short = Path(simplify(si, path.states, lambda: bool(ptc())))
-                # parts of motions that were checked are looked at in other places than before
+                # the other checker samples shortened motions at other states than before
                 if self.validator.accepts(short.states, lambda: bool(ptc())):
                     path = short
                     break
-        self._add(path)
+        self.report.add_solution(self, path, time.perf_counter() - started)
         if not ptc():
             with self.report.timed("polish"):
                 better = polished(self._optimizer, self.validator, path.states, lambda: bool(ptc()))
             if better is not None:
-                self._add(better)
+                self.report.add_solution(self, better, time.perf_counter() - started)
         return status.getStatus()
 
     def _inner_planners(self) -> list[ob.Planner]:
         return [self._inner]
-
-    def _add(self, path: Path) -> None:
-        self.report.lengths.append((time.perf_counter() - self._begin, path.length))
-        if self.report.best_path is None or path.length < self.report.best_path.length:
-            self.report.best_path = path
-        si, pdef = self.getSpaceInformation(), self.getProblemDefinition()
-        pdef.addSolutionPath(array_to_path(si, path.states), False, 0.0, NAME)
 
 
 @register(NAME)

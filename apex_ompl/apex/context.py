@@ -1,4 +1,4 @@
-"""Context of one call of ``solve``: what the stages of APEX share."""
+"""Context of one call of ``solve``, shared by the stages of APEX."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from ompl import base as ob
 
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.query import make_query, rough_kernel
-from apex_ompl.ompl.report import SolveReport
-from apex_ompl.ompl.space import array_to_path
+from apex_ompl.ompl.own_planner import SolveReport
 from apex_ompl.paths.candidates import Candidate, CandidatePool
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import Path
@@ -35,6 +34,7 @@ class SolveContext:
     """Query, checker, candidates, best path and budget of one call of ``solve``.
 
     Attributes:
+        planner: The planner, whose solutions are entered.
         si: OMPL's space information.
         pdef: OMPL's problem definition; solutions are added to it.
         ptc: OMPL's termination condition, the budget.
@@ -54,7 +54,7 @@ class SolveContext:
         best: Shortest valid path, or None.
         nearest: Path that ends near a goal and its distance from it [rad], or None.
         rng: Source of the generators of compiled trees.
-        sprint_trees: Compiled trees that a sprint began, or None.
+        sprint_trees: Compiled trees of the sprints, or None.
         sprint_ompl_trees: OMPL's, where another checker decides, by their longest step [rad].
         all_trees: Compiled trees for all starts and goals, or None.
         all_ompl_trees: OMPL's for all starts and goals, or None.
@@ -62,13 +62,14 @@ class SolveContext:
     """
 
     def __init__(
-        self, si: ob.SpaceInformation, pdef: ob.ProblemDefinition, ptc: ob.PlannerTerminationCondition, *,
-        validator: PathValidator, sampler: ProposalSampler, optimizer: Optimizer, report: SolveReport,
-        experience: list[Array], rejected_lines: list[Array], lambda_obs: float, rng: np.random.Generator,
+        self, planner: ob.Planner, ptc: ob.PlannerTerminationCondition, *, validator: PathValidator,
+        sampler: ProposalSampler, optimizer: Optimizer, report: SolveReport, experience: list[Array],
+        rejected_lines: list[Array], lambda_obs: float, rng: np.random.Generator,
     ) -> None:  # fmt: skip
         """Share what is given; starts and goals are read before the stages run."""
-        self.begin = time.perf_counter()
-        self.si, self.pdef, self.ptc = si, pdef, ptc
+        self.started = time.perf_counter()
+        self.planner, self.ptc = planner, ptc
+        self.si, self.pdef = planner.getSpaceInformation(), planner.getProblemDefinition()
         self.validator, self.sampler, self.optimizer, self.report = validator, sampler, optimizer, report
         self.experience, self.rejected_lines, self.lambda_obs = experience, rejected_lines, lambda_obs
         self.starts: list[Array] = []
@@ -98,7 +99,7 @@ class SolveContext:
         return self._queries
 
     def note_search(self, looked: SearchCounts) -> None:
-        """Add what a search in compiled code looked at to the checker's counts."""
+        """Add the checks of a search in compiled code to the checker's counts."""
         counts = self.validator.checker.check_counts
         counts.proved += looked.proved
         counts.blocked += looked.blocked
@@ -145,13 +146,10 @@ class SolveContext:
 
     def accept(self, path: Path) -> None:
         """Add a valid path to OMPL's solutions."""
-        elapsed = time.perf_counter() - self.begin
         if self.best is None:
-            self.report.first, self.report.first_path = elapsed, path
             self.report.first_verified = self.validator.knows_obstacles
-        self.report.lengths.append((elapsed, path.length))
-        self.best = self.report.best_path = path
-        self.pdef.addSolutionPath(array_to_path(self.si, path.states), False, 0.0, "apex")
+        self.report.add_solution(self.planner, path, time.perf_counter() - self.started)
+        self.best = path
 
     def accept_if_shorter(self, path: Path) -> bool:
         """Accept a valid path if it is shorter, and no nearer to obstacles than is wanted, or than the best path.
@@ -178,5 +176,5 @@ class SolveContext:
 
 
 def joins(control: Array, start: Array, goal: Array) -> bool:
-    """Whether control points, shape (points, dof), begin and end at a start and a goal, shape (dof,)."""
+    """Whether control points, shape (points, dof), start and end at a start and a goal, shape (dof,)."""
     return np.array_equal(control[0], start) and np.array_equal(control[-1], goal)

@@ -1,4 +1,4 @@
-"""What makes proposals for a robot."""
+"""Models of proposals: the checkpoint for a robot, or random perturbations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DEFAULT = "apex"  # checkpoint that ships
 AUTO, NONE = "auto", "none"  # names in the place of a checkpoint's
 
 Model = TrajectoryModel | PerturbationModel
-"""What makes proposals."""
+"""A model of proposals."""
 
 
 def has_model(robot: str) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypedDict
 
 from apex_ompl.ompl.parameters import Parameters, bounded, one_of, register
 from apex_ompl.ompl.tuned import TUNED
@@ -19,7 +19,7 @@ NAME = "apex"
 AUTO = "auto"  # what fits the setup
 TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and trees take turns
 QUICK_CALLS = 1500  # iterations of a bridge between rounds of proposals
-AGAIN = 8  # factor on the iterations of the sprint behind the short repair of the first round
+AGAIN = 8  # factor on the iterations of the sprint after the short repair of the first round
 SPRINT_FACTORS = (1, 8, 32)  # on those of the sprints before each round of proposals
 
 
@@ -36,11 +36,11 @@ class ApexParameters(Parameters):
         device: Where the network runs.
         line: Whether the straight line is a candidate.
         sprint: Iterations that RRT-Connect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
-            behind a short repair and before the second round it has 8 times as many, before the third 32 times.
+            after a short repair and before the second round it has 8 times as many, before the third 32 times.
             That is for trees in compiled code; OMPL's have an eighth.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
-        temperature: Factor on the standard deviation of the noise to begin with, that of the checkpoint.
+        temperature: Factor on the standard deviation of the checkpoint's initial noise.
         first: Proposals for each pair of start and goal in the first round.
         second: In the second.
         third: In the third.
@@ -50,8 +50,8 @@ class ApexParameters(Parameters):
             the paper has it.
         resample: How often colliding candidates are resampled in each round.
         noise: How far they are noised for that, as a share of the schedule.
-        lambda_obs: Valid paths that come nearer to an obstacle than this are resampled too; the one that keeps most
-            distance stands when none comes out better.
+        lambda_obs: Distance from obstacles below which valid paths are resampled, too; without a better one, the path
+            with the largest distance is taken.
         repair: Whether candidates are improved by the optimizer.
         bridge: Whether blocked stretches of the best candidates are bridged by short trees.
         fallback: Whether RRTConnect takes turns with more rounds of proposals in the time that is left, and sprints
@@ -140,7 +140,7 @@ class ApexParameters(Parameters):
         if self.approximate:
             found.append(stages.NearestToGoal())
         largest = max(self.batches, default=0)
-        temperatures = stages.TEMPERATURES if self.repair else (1.0,)  # a wider spread is worse where nothing mends it
+        temperatures = stages.TEMPERATURES if self.repair else (1.0,)  # a wider spread is worse without repair
         rounds = [proposal_round(largest, temperature) for temperature in temperatures if largest]
         ends: list[Stage] = [stages.Farthest(), *([stages.Bridging(self.range, TURN_CALLS)] if self.bridge else [])]
         trees = stages.GrowTrees(self.range, self.approximate) if self.fallback else None
@@ -156,3 +156,33 @@ class ApexParameters(Parameters):
         from apex_ompl.apex.planner import APEX
 
         return APEX(si, self)
+
+
+class ApexKeywords(TypedDict, total=False):
+    """:class:`ApexParameters` as keywords of :class:`apex_ompl.planners.APEX`, for editors and type checkers."""
+
+    model: str
+    robot: str
+    device: str
+    line: bool
+    sprint: int
+    sampler: str
+    denoising_steps: int
+    temperature: float
+    first: int
+    second: int
+    third: int
+    guidance: bool
+    gamma: float
+    scaling: str
+    resample: int
+    noise: float
+    lambda_obs: float
+    repair: bool
+    bridge: bool
+    fallback: bool
+    polish: bool
+    approximate: bool
+    anytime: bool
+    range: float
+    seed: int

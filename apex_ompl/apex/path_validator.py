@@ -1,4 +1,4 @@
-"""Validity of states and paths for a planner: this project's full check, or other checkers that OMPL was given."""
+"""Validity of states and paths for a planner: by this package's full check, or by a user's checkers."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from ompl import base as ob
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl.forwarding import forwarding
 from apex_ompl.ompl.simple_setup import SpaceInformation
 from apex_ompl.ompl.space import bounds_of, require_real_vectors, to_state
-from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker
+from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker, forwarding
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.types import Array, Flags
 
@@ -24,7 +23,7 @@ NOT_ACCEPTED = "the state validity checker that is set does not accept the path"
 
 LOG = logging.getLogger("apex_ompl")
 PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
-LOOKS = 8  # every so many states of a path are looked at before its motions, which have the others
+STRIDE = 8  # of the states of a path that are checked before its motions
 DEFAULT_ROBOT = "dual_panda_softhand"
 
 
@@ -140,7 +139,7 @@ class PathValidator:
         if self.exclusive:
             return True
         states = [to_state(self._si, q) for q in path]
-        first = sorted(range(0, len(states), LOOKS), key=lambda k: (-(k & -k), k))  # coarse before fine
+        first = sorted(range(0, len(states), STRIDE), key=lambda k: (-(k & -k), k))  # coarse before fine
         for k in first:
             if stop() or not self._si.isValid(states[k]):
                 return False

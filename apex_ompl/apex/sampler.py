@@ -13,7 +13,7 @@ from apex_ompl.model.diffusion import Estimate
 from apex_ompl.model.geometry import Numbers
 from apex_ompl.model.proposals import Proposals, Sampling
 from apex_ompl.model.query import Query
-from apex_ompl.ompl.report import SolveReport
+from apex_ompl.ompl.own_planner import SolveReport
 from apex_ompl.types import Array
 
 Stop = Callable[[], bool]

@@ -76,7 +76,7 @@ def rooted_ompl_trees(
 
 
 def grow(context: SolveContext, trees: TreePair, iterations: int) -> Array | None:
-    """Return the path of compiled trees after some more iterations, or None; count what they looked at."""
+    """Return the path of compiled trees after some more iterations, or None; add their checks to the counts."""
     found = trees.grow(iterations, context.stop)
     context.note_search(trees.take_counts())
     return found

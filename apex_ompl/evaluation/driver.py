@@ -20,7 +20,7 @@ from apex_ompl.evaluation.results import ABOUT, RUNS, SCHEMA, Results
 from apex_ompl.evaluation.rows import Job, Row, jobs
 from apex_ompl.evaluation.runs import RESULT
 from apex_ompl.evaluation.workers import Workers
-from apex_ompl.planning import check_arguments
+from apex_ompl.planning.planner import check_arguments
 from apex_ompl.util.files import locked, make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions
 from apex_ompl.util.resolution import SEARCH_RESOLUTION

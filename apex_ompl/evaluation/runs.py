@@ -19,14 +19,12 @@ from apex_ompl.api import load_problem
 from apex_ompl.errors import ApexError
 from apex_ompl.evaluation.accounting import PROOF, first_path_proof
 from apex_ompl.evaluation.rows import Job, load_runner
+from apex_ompl.ompl.own_planner import SolveReport, reporting
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl.report import SolveReport, report_of
-from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.path import path_length
-from apex_ompl.planning import PlanRun, finish, plan_among_dynamic_obstacles, query_fault, solve, with_exact_ends
+from apex_ompl.planning import PlanQuery, among_dynamic_obstacles, steps
 from apex_ompl.planning.among_dynamic_obstacles import STAGES
-from apex_ompl.planning.among_dynamic_obstacles import warm_up as warm_up_among_dynamic_obstacles
-from apex_ompl.planning.dynamic_obstacles import dynamic_of
+from apex_ompl.planning.query import dynamic_of
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
@@ -34,7 +32,6 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
 from apex_ompl.timing.smoothness import jerk
 from apex_ompl.types import Array
-from apex_ompl.util.deadline import Deadline
 
 Run = dict[str, Any]
 """A run as it is stored, ready for JSON."""
@@ -51,7 +48,7 @@ _robots: dict[str, Robot] = {}
 
 @dataclass(eq=False)
 class Experiment:
-    """Runs a planner in an experiment of ``ompl.tools.Benchmark``, in the place of ``planning.solving.execute``.
+    """Runs a planner in an experiment of ``ompl.tools.Benchmark``, in the place of ``planning.steps.execute``.
 
     Attributes:
         checks: Number of states that OMPL's experiment itself checked.
@@ -63,29 +60,30 @@ class Experiment:
     properties: dict[str, str] = field(default_factory=dict)
     common: dict[str, str] = field(default_factory=dict)
 
-    def __call__(self, run: PlanRun, planner: ob.Planner, timeout: float) -> PlanStatus:
+    def __call__(self, query: PlanQuery, planner: ob.Planner, timeout: float) -> PlanStatus:
         """Run the planner, and return its status; faults of the checkers are raised.
 
-        Of the run's time only the planner's own counts, not what the experiment measures.
+        Of the query's time only the planner's own counts, not what the experiment measures.
         """
-        left = run.deadline.remaining
-        check_counts, reports = run.setup.checker.check_counts, list[SolveReport | None]()
+        left = query.deadline.remaining
+        check_counts, reports = query.setup.checker.check_counts, list[SolveReport | None]()
         states = [check_counts.states]
 
         def before_run(_: ob.Planner) -> None:
-            seed_ompl(run.seed)  # the experiment itself has drawn and checked states by then
-            run.deadline.restart(left)
+            seed_ompl(query.setup.seed)  # the experiment itself has drawn and checked states by then
+            query.deadline.restart(left)
             states.append(check_counts.states)
 
         def after_run(*_: object) -> None:  # after it the experiment checks the path, and clears the planner
             states.append(check_counts.states)
-            reports.append(report_of(planner))
+            ours = reporting(planner)
+            reports.append(None if ours is None else ours.report)
 
-        observed, validator = list[float](), run.setup.motion_validator
+        observed, validator = list[float](), query.setup.motion_validator
         original = validator.check
-        if run.parameters.optimizing:
-            validator.check = _watched(run, observed)
-        experiment = ot.Benchmark(run.setup.simple_setup, "run")
+        if query.parameters.optimizing:
+            validator.check = _watched(query, observed)
+        experiment = ot.Benchmark(query.setup.simple_setup, "run")
         experiment.addPlanner(planner)
         experiment.setPreRunEvent(before_run)
         experiment.setPostRunEvent(after_run)
@@ -94,17 +92,17 @@ class Experiment:
             experiment.benchmark(request)
         finally:
             validator.check = original  # or a reference cycle would keep the whole problem alive
-        run.setup.raise_faults()
+        query.setup.raise_faults()
         self.checks = states[1] - states[0] + check_counts.states - states[2]
         if reports[0] is not None:
             planner.report = reports[0]
         recorded = experiment.getRecordedExperimentData().planners[0]
         self.properties, self.common = recorded.runs[0].to_dict(), recorded.common.to_dict()
-        run.times["solve"] = float(self.properties["time REAL"])
-        run.deadline.restart(left - run.times["solve"])
+        query.times["solve"] = float(self.properties["time REAL"])
+        query.deadline.restart(left - query.times["solve"])
         observed += [moment for data in recorded.runsProgressData for moment in _solved_at(data)]
         if observed:
-            run.times[FIRST] = min(observed)
+            query.times[FIRST] = min(observed)
         return ompl_status(self.properties)
 
 
@@ -118,9 +116,9 @@ def request_time(timeout: float) -> float:
     return (looks - 0.5) * LOOK
 
 
-def _watched(run: PlanRun, observed: list[float]) -> Callable[[Array, Array], bool]:
+def _watched(query: PlanQuery, observed: list[float]) -> Callable[[Array, Array], bool]:
     """Return a motion check whose first call after a path was found notes the time since its first call [s]."""
-    check, definition = run.setup.motion_validator.check, run.setup.simple_setup.getProblemDefinition()
+    check, definition = query.setup.motion_validator.check, query.setup.simple_setup.getProblemDefinition()
     begin = 0.0
 
     def watched(first: Array, second: Array) -> bool:
@@ -192,18 +190,16 @@ def _by_runner(job: Job) -> Run:
     return unsolved(str(status), "") | {"by": by, "load": os.getloadavg()[0]} | found
 
 
-def planned(job: Job) -> tuple[PlanRun, Experiment, PlanResult]:
-    """Return the call of ``plan`` of a run, OMPL's experiment, and the result."""
+def planned(job: Job) -> tuple[PlanQuery, Experiment, PlanResult]:
+    """Return the query of a run, OMPL's experiment, and the result."""
     started, experiment = time.perf_counter(), Experiment()
     with quiet_ompl():
-        planning = _ready(job, load_problem(job.problem), started)
-        result = query_fault(planning)  # the planner runs even where the straight line is a solution
-        if result is None:
-            result = solve(planning, job.simplify, experiment)
-        return planning, experiment, finish(planning, result, started)
+        query = _ready(job, load_problem(job.problem), started)
+        found = steps.solve(query, lines=False, execute=experiment)  # even where the straight line is a solution
+        return query, experiment, steps.time(steps.prove(found, job.simplify), timing=False)
 
 
-def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experiment, PlanResult]:
+def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanQuery, Experiment, PlanResult]:
     """Return a run among moving obstacles: as :func:`planned`, without OMPL's experiment and with the motion.
 
     Args:
@@ -213,30 +209,29 @@ def in_time(job: Job, stages: Sequence[str] = STAGES) -> tuple[PlanRun, Experime
     started, problem = time.perf_counter(), load_problem(job.problem)
     dynamic = dynamic_of(problem.scene)
     with quiet_ompl():
-        planning = _ready(job, problem.still, started)
-        planning.setup = replace(planning.setup, problem=problem)
-        warm_up_among_dynamic_obstacles(planning.setup.checker)
-        result = plan_among_dynamic_obstacles(planning, dynamic, job.simplify, Timing(), stages)
-        return planning, Experiment(), finish(planning, result, started)
+        query = _ready(job, problem.still, started)
+        query.setup = replace(query.setup, problem=problem)
+        among_dynamic_obstacles.warm_up(query.setup.checker)
+        result = among_dynamic_obstacles.plan_among_dynamic_obstacles(query, dynamic, job.simplify, Timing(), stages)
+        return query, Experiment(), result
 
 
-def _ready(job: Job, problem: Problem, started: float) -> PlanRun:
-    """Return the call of ``plan`` of a run on a problem, its seed set."""
+def _ready(job: Job, problem: Problem, started: float) -> PlanQuery:
+    """Return the query of a run, its seed set."""
     parameters = planners.parameters(job.planner, **job.params)
     if problem.robot not in _robots:
         _robots[problem.robot] = load_robot(problem.robot)
-    seed_ompl(job.seed)
-    ready = assemble(problem, _robots[problem.robot], seed=job.seed)
+    setup = steps.assemble(problem, _robots[problem.robot], seed=job.seed)
     times = {"setup": time.perf_counter() - started}
-    return PlanRun(ready, job.planner, parameters, job.seed, Deadline(job.timeout), times)
+    return steps.check(setup, parameters, timeout=job.timeout, started=started, times=times)
 
 
-def columns(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Run:
+def columns(query: PlanQuery, experiment: Experiment, result: PlanResult) -> Run:
     """Return the columns of a run that was planned."""
-    times, report = result.times, planning.report
+    times, report = result.times, query.report
     path = result.path.states if result and result.path is not None else None
     # Optimizing planners go on after their first path, which is not kept.
-    first_path = None if planning.parameters.optimizing else planning.first_path
+    first_path = None if query.parameters.optimizing else query.first_path
     raw = None if first_path is None else first_path.states
     found = path is not None
     total = sum(times.get(stage, 0.0) for stage in ("solve", "simplify", *PROOF))
@@ -244,8 +239,8 @@ def columns(planning: PlanRun, experiment: Experiment, result: PlanResult) -> Ru
     if result.dynamic_obstacles:  # the motion is what is asked for, and comes last
         first = total = times["total"] - times["setup"]
     elif report is None or not report.first_verified:  # the planner itself had not made the full check
-        setup = planning.setup
-        exact = None if first_path is None else with_exact_ends(setup, first_path).states
+        setup = query.setup
+        exact = None if first_path is None else steps.with_exact_ends(setup, first_path).states
         first = min(first + first_path_proof(setup.checker, exact, setup.start, setup.goals, times), total)
     return {
         "status": str(result.status), "reason": result.reason, "solved": found, "by": result.solved_by,

@@ -1,4 +1,4 @@
-"""What ends work inside of OMPL early: Ctrl-C, which must not raise in its callbacks, and the end of time."""
+"""Early termination inside OMPL: Ctrl-C, which must not raise in OMPL's callbacks, and deadlines."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ends_after(seconds: float) -> ob.PlannerTerminationCondition:
 
 
 class Interrupt:
-    """Calls Python's handler of SIGINT while planning; what it raises ends the planner, and is raised afterwards.
+    """Calls Python's handler of SIGINT while planning; an exception of it ends the planner, and is raised afterwards.
 
     Outside the main thread, where Python allows no signal handlers, it does nothing, nor where SIGINT is ignored, or
     handled by C code (as of ROS 2): that stays as it is.
@@ -57,7 +57,7 @@ class Interrupt:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Give SIGINT back, and raise what its handler raised."""
+        """Restore SIGINT's handler, and raise the exception of the handler."""
         if self._before is not None and signal.getsignal(signal.SIGINT) == self._handle:
             found = _Disposition()
             self._give_back()
@@ -97,7 +97,7 @@ class Interrupt:
 
 
 class _Disposition:
-    """What the process does at SIGINT, as the operating system has it: Python does not know what C code sets."""
+    """Disposition of SIGINT in the operating system: Python does not know handlers that C code sets."""
 
     def __init__(self) -> None:
         self._action = ctypes.create_string_buffer(ROOM)

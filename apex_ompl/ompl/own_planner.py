@@ -1,25 +1,115 @@
-"""What the planners of this package have in common inside of OMPL."""
+"""Base class of this package's OMPL planners, and the report that each makes."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from ompl import base as ob
+from ompl import geometric as og
 
 from apex_ompl.errors import ApexError
-from apex_ompl.ompl.report import SolveReport
-from apex_ompl.ompl.space import forget_states, to_state
+from apex_ompl.ompl.space import array_to_path, forget_states, to_state
+from apex_ompl.paths.path import Path
 from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
 from apex_ompl.util.exiting import running
+from apex_ompl.util.stopwatch import timed
 
 LOG = logging.getLogger("apex_ompl")
 Status = ob.PlannerStatus
 BAD_CAST = "std::bad_cast"  # message of the bindings where Python gave OMPL a value of another type
 NO_TRUTH = "the state validity checker must return True or False (OMPL takes no numpy.bool_): return bool(...)"
+
+
+@dataclass
+class SolveReport:
+    """Outcome of one call of ``solve``, by stages.
+
+    Attributes:
+        solved_by: Stage that found the first valid path: ``line``, ``experience``, ``apex`` or ``apex+resample``,
+            with ``+repair`` where the optimizer had to help; ``sprint``, ``apex+bridge`` or ``rrtconnect``; empty
+            without one.
+        reason: One sentence where there is no exact solution.
+        times: Seconds by stage; those of ``guidance`` and ``distance`` are part of other stages.
+        first: Seconds until the first valid path, NaN without one.
+        first_verified: Whether the first valid path had passed the full check by then.
+        first_path: First valid path, or None.
+        best_path: Shortest valid path, or None.
+        lengths: Time [s] and length [rad] of each path that was accepted as a solution.
+        candidates: Number of candidates before trees: straight lines, earlier paths, proposals.
+        proposed: Number of candidates that the model proposed.
+        resampled: Number of candidates from collision-triggered resampling.
+        steps: Number of optimizer steps in repair.
+        improved: Number of shorter paths that were found after the first one.
+        solutions: Paths that were added to OMPL's solutions, by ``id`` of OMPL's path, which is kept with each.
+    """
+
+    solved_by: str = ""
+    reason: str = ""
+    times: dict[str, float] = field(default_factory=dict)
+    first: float = float("nan")
+    first_verified: bool = False
+    first_path: Path | None = None
+    best_path: Path | None = None
+    lengths: list[tuple[float, float]] = field(default_factory=list)
+    candidates: int = 0
+    proposed: int = 0
+    resampled: int = 0
+    steps: int = 0
+    improved: int = 0
+    solutions: dict[int, tuple[og.PathGeometric, Path]] = field(default_factory=dict, repr=False)
+
+    __repr__ = fields_line
+
+    def timed(self, stage: str) -> AbstractContextManager[None]:
+        """Count the time of a block to a stage."""
+        return timed(self.times, stage)
+
+    def add_solution(self, planner: ob.Planner, path: Path, seconds: float) -> None:
+        """Add a valid path to OMPL's solutions, and note it.
+
+        Args:
+            planner: The planner that found it, in whose problem definition it is entered.
+            path: The path.
+            seconds: Time since the start of ``solve`` [s].
+        """
+        if self.first_path is None:
+            self.first, self.first_path = seconds, path
+        self.lengths.append((seconds, path.length))
+        if self.best_path is None or path.length < self.best_path.length:
+            self.best_path = path
+        solution = array_to_path(planner.getSpaceInformation(), path.states)
+        self.solutions[id(solution)] = solution, path
+        planner.getProblemDefinition().addSolutionPath(solution, False, 0.0, planner.getName())
+
+    def path_of(self, solution: ob.Path) -> Path | None:
+        """Return the path, with its spline, that was added as a solution of OMPL, or None for one that was not."""
+        found = self.solutions.get(id(solution))
+        return None if found is None else found[1]
+
+
+class ReportingPlanner(Protocol):
+    """Planner that reports on its last call of ``solve``.
+
+    Attributes:
+        report: The report.
+        rejected_lines: Straight lines that were found invalid before ``solve``, each of shape (2, dof); the planner
+            need not try them again.
+    """
+
+    report: SolveReport
+    rejected_lines: list[Array]
+
+
+def reporting(planner: Any) -> ReportingPlanner | None:
+    """Return a planner that makes reports, or None for one that does not, as OMPL's own."""
+    return planner if hasattr(planner, "report") else None
 
 
 class Tree(NamedTuple):
@@ -41,18 +131,20 @@ class OwnPlanner(ob.Planner):
 
     Attributes:
         report: Report on the last call of ``solve``.
+        rejected_lines: Straight lines that were found invalid before ``solve``, each of shape (2, dof).
     """
 
     def __init__(self, si: ob.SpaceInformation, name: str) -> None:
         """Plan in the space of ``si``."""
         super().__init__(si, name)
         self.report = SolveReport()
+        self.rejected_lines: list[Array] = []
         self._name = name
 
     def solve(self, ptc: ob.PlannerTerminationCondition) -> ob.PlannerStatus:
         """Solve the problem; no exception leaves it, since one would end the process inside OMPL.
 
-        Starts and goals are read anew by every call. ``report`` says what was done, and why where nothing was found.
+        Every call reads starts and goals again. ``report`` has times, counts, and the reason where nothing was found.
         """
         self.report = SolveReport()
         try:
@@ -78,7 +170,7 @@ class OwnPlanner(ob.Planner):
         raise NotImplementedError
 
     def clear(self) -> None:
-        """Forget what was found."""
+        """Forget the last solution."""
         super().clear()
         self.report = SolveReport()
 
@@ -94,7 +186,7 @@ class OwnPlanner(ob.Planner):
         if path is not None:
             trees.append(Tree(path.states, np.arange(-1, len(path.states) - 1), False))
         vertices: dict[bytes, ob.PlannerDataVertex] = {}
-        states = []  # which the data refers to until they are copied
+        states = []  # referenced by the data until they are copied
 
         def vertex(q: Array) -> ob.PlannerDataVertex:
             if q.tobytes() not in vertices:

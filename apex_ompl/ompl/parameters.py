@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.util.validation import LARGEST_INT, check_name
@@ -15,11 +15,16 @@ if TYPE_CHECKING:
     from ompl import base as ob
 
 
+Value = bool | float | str
+"""Value of a parameter; text is read as the type of the parameter."""
+
+
 @dataclass(frozen=True)
 class Parameters:
     """Parameters of one planner; a subclass per planner, whose defaults are the planner's.
 
     Attributes:
+        name: Name that the planner is registered under; empty for one that is not.
         optimizing: Whether the planner goes on improving until time is up.
         repeatable: Whether the same seed gives the same path; not for planners that are stopped by the clock
             or threaded.
@@ -27,6 +32,7 @@ class Parameters:
         threaded: Whether the planner runs threads of its own; OMPL 2.0.1's then deadlock over several goals.
     """
 
+    name: ClassVar[str] = ""
     optimizing: ClassVar[bool] = False
     repeatable: ClassVar[bool] = True
     smooth: ClassVar[bool] = False
@@ -45,7 +51,7 @@ class Parameters:
         """Return a planner for ``si`` with these parameters."""
         raise TypeError(f"{type(self).__name__} does not say how to build its planner")
 
-    def changed(self, /, **values: Any) -> Parameters:
+    def changed(self, /, **values: Value) -> Self:
         """Return a copy with some values changed; text is read as the field's type.
 
         Raises:
@@ -78,6 +84,7 @@ def register(name: str) -> Callable[[type[Parameters]], type[Parameters]]:
 
     def enter(cls: type[Parameters]) -> type[Parameters]:
         REGISTRY[name] = cls
+        cls.name = name
         return cls
 
     return enter

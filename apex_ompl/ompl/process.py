@@ -1,4 +1,4 @@
-"""What OMPL keeps for the whole process: its log level, and the seed of its random numbers."""
+"""OMPL's process-wide state: its log level, and the seed of its random numbers."""
 
 from __future__ import annotations
 

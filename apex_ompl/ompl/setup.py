@@ -48,8 +48,9 @@ class PlanningSetup:
             in the workspace that was not reached, why.
         alignment: The alignment goal, or None.
         held: Numbers of the joints that stay as at the start.
+        seed: Seed of the sampling of goals, and of the plan.
         notes: Sentences on joints of the start and the goals that were moved to their limits, and on meshes that are no
-            proper solids as they are, and how they are taken.
+            proper solids, and how they are interpreted.
     """
 
     problem: Problem
@@ -65,6 +66,7 @@ class PlanningSetup:
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
     held: NDArray[np.intp]
+    seed: int
     notes: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -73,7 +75,7 @@ class PlanningSetup:
         return one_line("PlanningSetup", repr(self.problem.name), f"robot {self.robot.name!r}", goals, self.start_fault)
 
     def raise_faults(self) -> None:
-        """Raise what the checkers kept inside of OMPL's callbacks, Ctrl-C among it."""
+        """Raise the exception that the checkers kept inside of OMPL's callbacks, such as Ctrl-C."""
         fault = self.validity_checker.fault or self.motion_validator.fault
         if fault is not None:
             raise fault
@@ -155,6 +157,7 @@ def assemble(
         goal_faults,
         sampled if isinstance(sampled, AlignmentGoal) else None,
         held,
+        seed,
         (*notes, *checker.mesh_notes),
     )
 

@@ -1,4 +1,4 @@
-"""OMPL's SimpleSetup for a robot: what its bindings leave out, for planners of OMPL's own as well."""
+"""OMPL's SimpleSetup for a robot, with what OMPL's Python bindings lack, for OMPL's own planners too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.ompl.interrupt import ends_after
-from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.space import Bounds, await_goal, state_space
 from apex_ompl.robot import Robot
 from apex_ompl.util.exiting import running
@@ -70,8 +69,9 @@ class SimpleSetup(og.SimpleSetup):
     def getPlannerData(self, data: ob.PlannerData) -> None:  # noqa: N802 - OMPL's name
         """Fill in the states and motions that the planner knows."""
         planner = self.getPlanner()
-        if isinstance(planner, OwnPlanner):
-            planner.fill_data(data)
+        fill_data = getattr(planner, "fill_data", None)  # of this package's planners
+        if fill_data is not None:
+            fill_data(data)
         else:
             super().getPlannerData(data)
 

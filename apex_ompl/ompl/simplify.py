@@ -9,9 +9,8 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.ompl.forwarding import forwarding
 from apex_ompl.ompl.space import array_to_path, path_to_array
-from apex_ompl.ompl.validity import MotionValidator, motions_until
+from apex_ompl.ompl.validity import MotionValidator, forwarding, motions_until
 from apex_ompl.paths.path import path_length
 from apex_ompl.types import Array
 

@@ -23,7 +23,7 @@ from apex_ompl.util.resolution import SEARCH_RESOLUTION
 Bounds = tuple[Array, Array]
 """Lowest and highest positions of the joints, each of shape (dof,) [rad; synergies 0..1]."""
 
-GOAL_LOOK = 0.002  # between two looks for a goal that another thread samples [s]
+GOAL_LOOK = 0.002  # period at which a goal that another thread samples is polled [s]
 
 
 def state_space(
@@ -118,8 +118,8 @@ def motions_free(si: ob.SpaceInformation, first: Array, last: Array) -> Flags:
 
     Args:
         si: OMPL's space information.
-        first: States that they begin at, taken to be free, shape (N, dof).
-        last: States that they end at, shape (N, dof).
+        first: First states, assumed free, shape (N, dof).
+        last: Last states, shape (N, dof).
     """
     a, b, found = new_state(si), new_state(si), []
     for p, q in zip(first.tolist(), last.tolist(), strict=True):

@@ -82,7 +82,7 @@ class StateValidityChecker(ob.StateValidityChecker):
 
 
 class MotionValidator(ob.MotionValidator):
-    """OMPL motion validator: by a check of its own as long as its validity checker is set, and else by the one that is.
+    """OMPL motion validator by its own check, as long as its own validity checker is the one that is set.
 
     ``setStateValidityChecker`` of OMPL leaves the motion validator as it is. So this one asks at each motion which
     checker the space information has; another one than its own is asked for states between both ends by OMPL's own
@@ -130,12 +130,43 @@ class MotionValidator(ob.MotionValidator):
         return bool(self._discrete.checkMotion(first, second))
 
 
+class _Forwarding(ob.MotionValidator):
+    def __init__(
+        self, made: ob.SpaceInformation, si: ob.SpaceInformation, stop: Callable[[], bool], walks: bool
+    ) -> None:  # fmt: skip
+        super().__init__(made)
+        self._si, self._stop = si, stop
+        self._walk = made.getMotionValidator() if walks else None
+
+    def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802 - OMPL's name
+        if self._stop() or not self._si.checkMotion(first, second):
+            return False
+        return self._walk is None or bool(self._walk.checkMotion(first, second))
+
+
+def forwarding(
+    si: ob.SpaceInformation, *, stop: Callable[[], bool] = lambda: False, walks: bool = False
+) -> ob.SpaceInformation:
+    """Return a space information of the same space, whose checkers accept at most what those of the given one accept.
+
+    Args:
+        si: The given one; its current checkers are asked.
+        stop: No motion is valid once this holds.
+        walks: Whether motions are valid only where states between their ends are, too, at the space's resolution.
+    """
+    made = ob.SpaceInformation(si.getStateSpace())
+    made.setStateValidityChecker(lambda state: bool(si.isValid(state)))
+    made.setMotionValidator(_Forwarding(made, si, stop, walks))
+    made.setup()
+    return made
+
+
 @contextmanager
 def motions_until(validator: MotionValidator, stop: Callable[[], bool]) -> Iterator[None]:
     """While the block runs, let all motions be invalid once ``stop`` holds.
 
-    OMPL looks at a termination condition between iterations and not inside of them, and simplifies paths by counts:
-    without motions to check, both soon come to their end.
+    OMPL checks a termination condition between iterations only, and simplifies paths by counts: without valid motions,
+    both soon end.
     """
     before = validator.stop
     validator.stop = lambda: stop() or before()
@@ -180,8 +211,8 @@ def full_check(
 ) -> FullCheck:
     """Decide whether a path or a motion is a solution.
 
-    It is when it stays inside the limits, begins at ``start`` and ends at one of ``goals`` bit for bit, and is proved
-    free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`).
+    It is one when it stays inside the limits, starts at ``start`` and ends at one of ``goals`` bit for bit, and is
+    proved free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`).
 
     Args:
         checker: Collision checker.

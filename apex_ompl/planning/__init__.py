@@ -1,4 +1,7 @@
-"""Planning: a planner that is kept with its world, and the steps of a plan, which benchmarks compose, too."""
+"""Planning: a planner that is kept with its world, and the five steps of a plan, each for itself.
+
+``assemble -> check -> solve -> prove -> time``; see :mod:`apex_ompl.planning.steps`.
+"""
 
 from __future__ import annotations
 
@@ -7,62 +10,44 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.planning.among_dynamic_obstacles import plan_among_dynamic_obstacles
-    from apex_ompl.planning.one_plan import check_arguments
     from apex_ompl.planning.planner import MotionPlanner, StateCheck
-    from apex_ompl.planning.pool import kept_planner
-    from apex_ompl.planning.run import PlanRun
-    from apex_ompl.planning.solving import (
-        NOT_PROVED,
-        STRAIGHT_LINE,
-        find_path,
-        query_fault,
+    from apex_ompl.planning.query import GoalSampler
+    from apex_ompl.planning.steps import (
+        FoundPath,
+        PlanQuery,
+        ProvedPath,
+        assemble,
+        check,
+        prove,
         solve,
-        straight_line,
-        verify,
-        with_exact_ends,
+        time,
     )
-    from apex_ompl.planning.timing import finish, parameterize
     from apex_ompl.planning.world import World
 
 __all__ = [
-    "NOT_PROVED",
-    "STRAIGHT_LINE",
+    "FoundPath",
+    "GoalSampler",
     "MotionPlanner",
-    "PlanRun",
+    "PlanQuery",
+    "ProvedPath",
     "StateCheck",
     "World",
-    "check_arguments",
-    "find_path",
-    "finish",
-    "kept_planner",
-    "parameterize",
-    "plan_among_dynamic_obstacles",
-    "query_fault",
+    "assemble",
+    "check",
+    "prove",
     "solve",
-    "straight_line",
-    "verify",
-    "with_exact_ends",
+    "time",
 ]
+
+_STEPS = ("FoundPath", "PlanQuery", "ProvedPath", "assemble", "check", "prove", "solve", "time")
 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "GoalSampler": "query",
         "MotionPlanner": "planner",
-        "PlanRun": "run",
         "StateCheck": "planner",
         "World": "world",
-        "check_arguments": "one_plan",
-        "finish": "timing",
-        "kept_planner": "pool",
-        "parameterize": "timing",
-        "plan_among_dynamic_obstacles": "among_dynamic_obstacles",
-        **dict.fromkeys(
-            (
-                "NOT_PROVED", "STRAIGHT_LINE", "find_path", "query_fault", "solve", "straight_line", "verify",
-                "with_exact_ends",
-            ),
-            "solving",
-        ),
+        **dict.fromkeys(_STEPS, "steps"),
     },
-)  # fmt: skip
+)

@@ -1,9 +1,9 @@
-"""Plans among obstacles that move at constant velocity: motions in time, proved in time.
+"""Plans among dynamic obstacles of constant velocity, proved in time.
 
-1. A path among what stands still is found and timed as ever; where its motion meets no dynamic obstacle, that is the
-plan. 2. Else the motion along the path is retimed: it waits, slows down or hurries (:mod:`apex_ompl.moving.retime`).
+1. A path among the static obstacles is found and timed. Where its motion meets no dynamic obstacle, it is the plan.
+2. Otherwise the motion along the path is retimed: it waits, slows down or speeds up (:mod:`apex_ompl.moving.retime`).
 3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.timed_spline`).
-4. Where all that fails, paths are planned around what the dynamic obstacles sweep.
+4. Where all that fails, paths are planned around the volumes that the dynamic obstacles sweep.
 
 The motion that arrives first is taken.
 """
@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,16 +26,15 @@ from apex_ompl.moving.timed_proof import TimedProver
 from apex_ompl.moving.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.paths.path import Path
-from apex_ompl.planning.motion_guesses import guesses
-from apex_ompl.planning.run import PlanRun
-from apex_ompl.planning.solving import find_path, query_fault
-from apex_ompl.planning.timing import parameterize
+from apex_ompl.planning.steps import FoundPath, PlanQuery, finish, prove, query_fault, solve, time
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.types import Array
 from apex_ompl.util.deadline import Deadline
 from apex_ompl.util.stopwatch import timed
 
@@ -44,24 +44,28 @@ FACTORS = (1.0, 1.3, 1.7, 2.4, 3.5, 5.0)  # durations that are tried, as multipl
 MARGIN = 0.005  # that motions keep from dynamic obstacles, where the start does [m]
 LONGER = 3  # turns, each with durations twice as long as the one before
 PATH_STATES = (256, 1024)  # of the path of a motion, the first number for which it is proved
-SWEPT_SECONDS = 6.0  # of the dynamic obstacles' ways that paths are planned around [s]
+SWEPT_SECONDS = 6.0  # of the dynamic obstacles' motions that paths are planned around [s]
 SWEPT_SHARE = 0.3  # of the time that is left, for that
-SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places on the way [m], and most of these
+SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places [m], and the largest number of these
+
+
+NEAREST_GOALS = 2  # nearest goals of which there are several
+PERTURBATIONS = 4  # of the straight line to each goal
 
 
 @dataclass(frozen=True)
 class Among:
-    """What a plan among dynamic obstacles works on.
+    """Context of a plan among dynamic obstacles.
 
     Attributes:
-        run: The call of ``plan``, among what stands still.
-        prover: The proof of motions.
+        query: The query, among the static obstacles.
+        prover: Proves motions.
         timing: How motions are timed.
         limits: The limits by it.
         stages: Those of ``STAGES`` that are tried.
     """
 
-    run: PlanRun
+    query: PlanQuery
     prover: TimedProver
     timing: Timing
     limits: Limits
@@ -69,25 +73,25 @@ class Among:
 
     def stop(self) -> bool:
         """Whether time is up."""
-        return self.run.interrupt.pressed or self.run.deadline.expired
+        return self.query.ends()
 
     @property
     def kernel(self) -> Kernel:
-        """The kernel among what stands still, in which joints that are not planned stay."""
-        setup, arrays = self.run.setup, self.run.setup.checker.kernel.robot.arrays
+        """The kernel among the static obstacles, in which joints that are not planned stay."""
+        setup, arrays = self.query.setup, self.query.setup.checker.kernel.robot.arrays
         lower, upper = arrays.lower.copy(), arrays.upper.copy()
         lower[setup.held] = upper[setup.held] = setup.start[setup.held]
         return setup.checker.kernel.within(lower, upper)
 
     def proof(self, motion: Trajectory) -> PathProof | None:
-        """Return the proof that a motion is clear of what stands still and of itself, or None.
+        """Return the certificate that a motion is clear of static obstacles and of itself, or None.
 
         It is None, too, where the motion meets a dynamic obstacle, or does not go from the start to a goal.
         """
-        setup = self.run.setup
+        setup = self.query.setup
         if not self.prover.prove(motion, stop=self.stop):
             return None
-        check = full_check(setup.checker, motion, setup.start, setup.goals, deadline=self.run.deadline.at)
+        check = full_check(setup.checker, motion, setup.start, setup.goals, deadline=self.query.deadline.at)
         return check.proof if check else None
 
     def accepts(self, motion: Trajectory) -> bool:
@@ -96,44 +100,45 @@ class Among:
 
 
 def plan_among_dynamic_obstacles(
-    run: PlanRun, dynamic: Sequence[Obstacle], simplify: bool, timing: Timing, stages: Sequence[str] = STAGES
+    query: PlanQuery, dynamic: Sequence[Obstacle], simplify: bool, timing: Timing, stages: Sequence[str] = STAGES
 ) -> PlanResult:
-    """Return a motion among obstacles that move, or why there is none.
+    """Return a motion among dynamic obstacles, or why there is none.
 
     Args:
-        run: The call of ``plan`` on a problem that is set up without the dynamic obstacles.
-        dynamic: The obstacles that move, where they are at time 0, when the motion begins.
+        query: The query, set up without the dynamic obstacles.
+        dynamic: The dynamic obstacles, where they are at time 0, when the motion starts.
         simplify: Whether paths of planners that leave it to others are shortened.
         timing: How motions are timed.
         stages: Those of ``STAGES`` that are tried where the path's own motion meets a dynamic obstacle.
 
     Raises:
-        ApexError: As :func:`apex_ompl.planning.solving.find_path`.
+        ApexError: As :func:`apex_ompl.planning.steps.solve`.
     """
-    setup, problem = run.setup, run.setup.problem
-    fault = query_fault(run)
-    if fault is not None:
-        return fault
+    setup, problem = query.setup, query.setup.problem
+    if query.status is not None:
+        return _unsolved(query, query.status, query.reason)
     meets = TimedProver(setup.checker, dynamic, problem.allowed).fault_at_start(setup.start)
     if meets:
-        return run.result(PlanStatus.INVALID_START, f"at 0 s: {meets}")
+        return _unsolved(query, PlanStatus.INVALID_START, f"at 0 s: {meets}")
     prover = TimedProver(setup.checker, dynamic, problem.allowed, margin=MARGIN)
     if prover.fault_at_start(setup.start):
         prover = TimedProver(setup.checker, dynamic, problem.allowed)
     robot = setup.robot
-    among = Among(run, prover, timing, timing.limits(robot.limits, robot.joint_names), stages)
-    still = parameterize(run, find_path(run, simplify), timing)
+    among = Among(query, prover, timing, timing.limits(robot.limits, robot.joint_names), stages)
+    still = time(prove(solve(query), simplify), timing)
     if not still or still.trajectory is None:
         return still
-    with timed(run.times, "dynamic_obstacles"):
+    with timed(query.times, "dynamic_obstacles"):
         proof = prover.prove(still.trajectory, stop=among.stop)
         found = still if proof else _in_time(among, still, simplify)
     if found is not None:
-        return replace(found, dynamic_obstacles=tuple(o.name for o in dynamic))
-    return run.result(
-        PlanStatus.TIMEOUT,
-        f"no motion among the moving obstacles was found in time; that along the path, {proof.reason}",
-    )
+        return finish(query, replace(found, dynamic_obstacles=tuple(o.name for o in dynamic)))
+    reason = f"no motion among the moving obstacles was found in time; that along the path, {proof.reason}"
+    return _unsolved(query, PlanStatus.TIMEOUT, reason)
+
+
+def _unsolved(query: PlanQuery, status: PlanStatus, reason: str) -> PlanResult:
+    return finish(query, FoundPath(query, status, reason).result())
 
 
 def _in_time(among: Among, still: PlanResult, simplify: bool) -> PlanResult | None:
@@ -170,7 +175,7 @@ def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
     return replace(
         still, trajectory=made.trajectory, solved_by=f"{still.solved_by}+{RETIMED}", timing_method=RETIMED,
         deviation=still.deviation + math.sqrt(motion.dof) * made.deviation,
-        limit_use=made.trajectory.use(among.run.setup.robot.limits), motion_clearance=proof.clearance,
+        limit_use=made.trajectory.use(among.query.setup.robot.limits), motion_clearance=proof.clearance,
     )  # fmt: skip
 
 
@@ -178,10 +183,10 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
     """Return the motion that is optimized in space and time and ends first, or None.
 
     Args:
-        among: What it works on.
-        still: The path among what stands still, with its motion.
-        turn: Number of times that it was called before; bumps become larger.
-        best: A result; motions that end no earlier are not looked for.
+        among: The context.
+        still: The path among the static obstacles, with its motion.
+        turn: Number of times that it was called before; perturbations become larger.
+        best: A result; motions that end no earlier are skipped.
     """
     motion = still.trajectory
     assert motion is not None
@@ -189,7 +194,7 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
     found = None if best is None else best.trajectory
     given = found
     for factor in FACTORS:
-        for guess in guesses(among.run, among.limits, motion, turn):
+        for guess in _guesses(among.query, among.limits, motion, turn):
             duration = factor * 2.0 ** min(turn, LONGER) * guess.duration
             if among.stop():
                 break
@@ -205,8 +210,8 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
 
 
 def _start(among: Among) -> Start:
-    """Return what the robot does when the motion begins."""
-    q = among.run.setup.start
+    """Return position, velocity and acceleration at the start of the motion."""
+    q = among.query.setup.start
     derivatives = among.timing.start(among.limits)
     return Start.at_rest(q) if derivatives is None else Start(q, *derivatives)
 
@@ -215,7 +220,7 @@ _warm: set[str] = set()  # robots of which the code is loaded
 
 
 def warm_up(checker: CollisionChecker) -> None:
-    """Load, or compile, what plans among dynamic obstacles need besides, so that no plan has to wait for it."""
+    """Load or compile the code that only plans among dynamic obstacles need, so that no plan waits for it."""
     robot = checker.robot
     if robot.name in _warm:
         return
@@ -234,24 +239,25 @@ def warm_up(checker: CollisionChecker) -> None:
 
 
 def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
-    """Return the motion of a path that is planned around what the dynamic obstacles sweep, or None."""
-    run, problem = among.run, among.run.setup.problem
-    names = [name for k, name in enumerate(run.setup.robot.joint_names) if k not in run.setup.held]
+    """Return the motion of a path around the volumes that the dynamic obstacles sweep, or None."""
+    query, robot, problem = among.query, among.query.setup.robot, among.query.setup.problem
+    names = [name for k, name in enumerate(robot.joint_names) if k not in query.setup.held]
     swept = [copy for o in among.prover.obstacles for copy in _sweep(o)]
     blocked = problem.still.model_copy(update={"scene": (*problem.still.scene, *swept)})
-    setup = replace(assemble(blocked, run.setup.robot, seed=run.seed, moving=names), problem=problem)
-    deadline = Deadline(max(1e-3, SWEPT_SHARE * run.deadline.remaining))
-    inner = replace(run, setup=setup, deadline=deadline, rejected_lines=[])
-    found = parameterize(inner, find_path(inner, simplify), among.timing)
+    setup = replace(assemble(blocked, robot, seed=query.setup.seed, moving=names), problem=problem)
+    deadline = Deadline(max(1e-3, SWEPT_SHARE * query.deadline.remaining))
+    status, reason = query_fault(setup)
+    inner = replace(query, setup=setup, deadline=deadline, status=status, reason=reason, rejected_lines=[])
+    found = time(prove(solve(inner), simplify), among.timing)
     if not found or found.trajectory is None or not among.accepts(found.trajectory):
         return None
     return replace(found, solved_by=f"{found.solved_by}+{SWEPT}")
 
 
 def _sweep(obstacle: Obstacle) -> list[Obstacle]:
-    """Return copies of an obstacle along its way."""
-    way = SWEPT_SECONDS * float(np.linalg.norm(obstacle.velocity or (0.0, 0.0, 0.0)))
-    times = np.linspace(0.0, SWEPT_SECONDS, min(MOST_COPIES, 2 + int(way / SWEPT_STEP)))
+    """Return copies of an obstacle along its path."""
+    length = SWEPT_SECONDS * float(np.linalg.norm(obstacle.velocity or (0.0, 0.0, 0.0)))
+    times = np.linspace(0.0, SWEPT_SECONDS, min(MOST_COPIES, 2 + int(length / SWEPT_STEP)))
     return [
         obstacle_at(obstacle, float(t)).model_copy(update={"name": f"{obstacle.name} at {t:.2f} s", "velocity": None})
         for t in times
@@ -259,24 +265,69 @@ def _sweep(obstacle: Obstacle) -> list[Obstacle]:
 
 
 def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) -> PlanResult | None:
-    """Return a result with another motion, and with the way that it takes as its path, or None."""
-    run, proof = among.run, among.proof(motion)
+    """Return a result with another motion and with its path, or None."""
+    query, proof = among.query, among.proof(motion)
     if proof is None:
         return None
     for count in PATH_STATES:
         times = np.linspace(0.0, motion.duration, count)
         states = motion(times)
-        check = full_check(run.setup.checker, states, run.setup.start, run.setup.goals, deadline=run.deadline.at)
+        check = full_check(
+            query.setup.checker, states, query.setup.start, query.setup.goals, deadline=query.deadline.at
+        )
         if check:
             break
     else:
         return None
     largest = np.linalg.norm(np.abs(motion.accelerations).max(axis=0))
-    exact = run.result(
-        PlanStatus.EXACT_SOLUTION, path=Path(states), solved_by=f"{still.solved_by}+{method}", proof=check.proof
-    )
+    solved_by = f"{still.solved_by}+{method}"
+    exact = FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(states), solved_by, check.proof)
     return replace(
-        exact, trajectory=motion, limit_use=motion.use(run.setup.robot.limits), timing_method=method,
+        exact.result(), trajectory=motion, limit_use=motion.use(query.setup.robot.limits), timing_method=method,
         deviation=float(largest * (times[1] - times[0]) ** 2 / 8.0),
         motion_clearance=proof.clearance,
     )  # fmt: skip
+
+
+class Guess(NamedTuple):
+    """A motion to start from.
+
+    Attributes:
+        states: States evenly spaced in time, shape (N, dof).
+        duration: Its duration [s].
+    """
+
+    states: Array
+    duration: float
+
+
+def _guesses(query: PlanQuery, limits: Limits, motion: Trajectory, turn: int) -> Iterator[Guess]:
+    """Yield motions to start from: the path's own, straight lines, and random perturbations of them.
+
+    Args:
+        query: The query, among the static obstacles.
+        limits: Those of the motion.
+        motion: The path's own.
+        turn: Number of times that guesses were asked for before; perturbations become larger.
+    """
+    optimizer, held = Optimizer(), query.setup.held
+    if turn == 0:
+        yield Guess(motion(np.linspace(0.0, motion.duration, 256)), motion.duration)
+    goals, rng = query.setup.valid_goals, np.random.default_rng([query.setup.seed, turn])
+    for goal in goals[np.argsort(np.linalg.norm(goals - query.setup.start, axis=1))][:NEAREST_GOALS]:
+        size = PERTURBATION_SIZE * (1 + turn % 3)
+        for control in optimizer.starts(query.setup.start, goal, PERTURBATIONS, rng, size):
+            control[:, held] = query.setup.start[held]
+            states = optimizer.spline.path(control)
+            yield Guess(states, _least_duration(states, limits))
+            if turn > 0:  # aside, back, and then along the line
+                aside = states - optimizer.spline.path(optimizer.spline.line(states[0], goal))
+                line = np.linspace(states[0], goal, len(states))
+                yield Guess(np.concatenate([states[0] + aside, line]), _least_duration(line, limits))
+
+
+def _least_duration(states: Array, limits: Limits) -> float:
+    """Return about how long a path takes at an even pace of its parameter [s]."""
+    speed = np.abs(np.diff(states, axis=0)) * (len(states) - 1)
+    distance = np.abs(states[-1] - states[0]) / limits.acceleration
+    return float(max((speed / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))

@@ -1,8 +1,8 @@
-"""Starts that touch something: the way out of a contact along growing clearance, before the plan proper.
+"""Starts in contact: a short straight motion along increasing clearance, before the plan itself.
 
-Real robots report states in which a hand rests on a table or an object on a shelf, by fractions of a millimeter inside
-of the model. A plan may begin there where the caller allows it (``leave_contact``): a short straight motion leads out
-of the contact, and what follows is planned and proved as ever.
+Real robots report states in which a hand rests on a table, or an object on a shelf, fractions of a millimeter inside of
+the model. A plan may start there where the caller allows it (``leave_contact``): a short straight motion leaves the
+contact, and the remaining motion is planned and proved as usual.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.ompl.setup import PlanningSetup, state_fault
+from apex_ompl.ompl.setup import PlanningSetup, assemble, state_fault
 from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult
 from apex_ompl.timing import Timing, time_path
@@ -21,24 +21,24 @@ from apex_ompl.timing.trajectory import concatenate
 from apex_ompl.types import Array
 
 LARGEST_DEPTH = 1e-3  # of contacts that the refusal of a start names ``leave_contact`` for [m]
-FREE = 1e-4  # clearance at which a way out may end [m]
-REACH = 0.15  # longest way out [rad, max-norm]
+FREE = 1e-4  # clearance at which this motion may end [m]
+REACH = 0.15  # longest motion [rad, max-norm]
 STEP = 1e-3  # spacing of the states that are checked on it [rad, max-norm]
 ROUNDING = 1e-7  # by which distances of contacts are uncertain [m]
-DIRECTIONS = 64  # tried at random where the gradient leads nowhere
+DIRECTIONS = 64  # random ones, tried where the gradient fails
 DIFFERENCE = 1e-4  # of the finite differences [rad]
 
 
 @dataclass(frozen=True, eq=False)
 class Departure:
-    """A straight way out of a contact.
+    """A straight motion out of a contact.
 
     Attributes:
         start: The start, shape (dof,).
         end: First state of the plan that follows, shape (dof,).
         depth: Depth of the deepest contact at the start [m].
         contact: Names of the two bodies of that contact.
-        states: Number of states that were checked between.
+        states: Number of states between them that were checked.
     """
 
     start: Array
@@ -49,7 +49,7 @@ class Departure:
 
     @property
     def note(self) -> str:
-        """What a user should know."""
+        """Note for the user."""
         first, second = self.contact
         length = float(np.abs(self.end - self.start).max())
         return (
@@ -59,10 +59,10 @@ class Departure:
 
 
 def find_departure(setup: PlanningSetup, most: float, seed: int = 0) -> Departure | None:
-    """Return a way out of the contacts at the start, or None where they are deeper than ``most`` or no way is found.
+    """Return a motion out of the contacts at the start, or None where one is deeper than ``most`` or none is found.
 
-    The clearance, of the nearest pair, does not fall along the way by more than rounding; its end is free. The
-    direction is the gradient of the clearance, or one of a few drawn at random that climb.
+    The clearance of the nearest pair does not decrease along it by more than rounding, and its end is free. The
+    direction is the gradient of the clearance, or one of a few random directions with a positive slope.
 
     Args:
         setup: A problem whose start is invalid.
@@ -91,8 +91,26 @@ def find_departure(setup: PlanningSetup, most: float, seed: int = 0) -> Departur
     return None
 
 
+def departed(setup: PlanningSetup, most: float, seed: int) -> tuple[Departure | None, PlanningSetup]:
+    """Return a motion out of the contacts at an invalid start, and the problem from its end; else None and the problem.
+
+    Args:
+        setup: The problem.
+        most: Largest depth of a contact [m].
+        seed: Seed of the directions, and of the goals that are sampled again.
+    """
+    departure = find_departure(setup, most, seed) if setup.start_fault else None
+    if departure is None:
+        return None, setup
+    names = setup.robot.joint_names
+    start = dict(zip(names, departure.end.tolist(), strict=True))
+    moving = [name for k, name in enumerate(names) if k not in setup.held]
+    problem = setup.problem.model_copy(update={"start": start})
+    return departure, assemble(problem, setup.robot, seed=seed, checker=setup.checker, moving=moving)
+
+
 def remedy(setup: PlanningSetup) -> str:
-    """Return what to do about a start that touches something a little, or nothing."""
+    """Return advice on a start in slight contact, or an empty text."""
     checker, start = setup.checker, setup.start
     if checker.robot.limit_fault(start) or checker.clearance(start) < -LARGEST_DEPTH:
         return ""
@@ -104,8 +122,8 @@ def with_departure(result: PlanResult, setup: PlanningSetup, departure: Departur
 
     Args:
         result: Result of the plan that follows.
-        setup: The problem as it was given.
-        departure: The way to the start of that plan.
+        setup: The given problem.
+        departure: The motion to the start of that plan.
         timing: How motions are timed.
     """
     notes = (*result.notes, departure.note)
@@ -123,13 +141,13 @@ def with_departure(result: PlanResult, setup: PlanningSetup, departure: Departur
 
 
 def _nearest_pair(checker: CollisionChecker, q: Array) -> tuple[str, str]:
-    """Return the names of the pair of bodies that is nearest at a state, shape (dof,)."""
+    """Return the names of the nearest pair of bodies at a state, shape (dof,)."""
     pair: tuple[str, str] = checker.prove(q[None], tolerance=0.0).pair
     return pair
 
 
 def _gradient(checker: CollisionChecker, q: Array, free: NDArray[np.integer]) -> Array:
-    """Return the gradient of the clearance by finite differences, shape (dof,) [m/rad]; 0 for joints that stay."""
+    """Return the gradient of the clearance by finite differences, shape (dof,) [m/rad]; 0 for other joints."""
     found, limits = np.zeros(len(q)), checker.robot.limits
     for k in free:
         low, high = q.copy(), q.copy()
@@ -140,7 +158,7 @@ def _gradient(checker: CollisionChecker, q: Array, free: NDArray[np.integer]) ->
 
 
 def _climbed(setup: PlanningSetup, direction: Array) -> tuple[Array, int] | None:
-    """Return the first free state along a direction, and the number of states on the way, or None if there is none."""
+    """Return the first free state along a direction and the number of states up to it, or None."""
     checker, limits = setup.checker, setup.robot.limits
     before = checker.clearance(setup.start)
     for k in range(1, int(REACH / STEP) + 1):

@@ -1,4 +1,4 @@
-"""A planner that is kept: a robot, a model and a world that stay ready between plans.
+"""A planner that is kept: a robot, a model and a world that stay ready between plans; ``plan`` lends such planners.
 
 What plans need is imported when a planner is made, so that the import of this module is quick.
 """
@@ -7,26 +7,94 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Set
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Set
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, Unpack
+from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
 
 from apex_ompl import planners
+from apex_ompl.errors import ParameterError
 from apex_ompl.util.display import one_line
 from apex_ompl.util.exiting import running
 from apex_ompl.util.forking import ProcessLock, unforked
-from apex_ompl.util.validation import check_options
+from apex_ompl.util.validation import check_flag, check_number, check_options, check_positive, check_seed
 
 if TYPE_CHECKING:
     from ompl import geometric as og
 
     from apex_ompl.collision import CollisionChecker, Contact
-    from apex_ompl.planning.one_plan import PlanKeywords, ProblemKeywords
+    from apex_ompl.planners import AnyPlanner
     from apex_ompl.planning.query import Group, State, Target
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
+    from apex_ompl.scene.bodies import Obstacle
     from apex_ompl.scene.problem import Problem
+    from apex_ompl.timing import Timing
+
+MOST_IDLE = 4  # planners of a robot that are kept
+_Stamps = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Options of a plan, see :func:`apex_ompl.plan` and :meth:`apex_ompl.MotionPlanner.plan`."""
+
+    timeout: float = 5.0
+    seed: int = 0
+    simplify: bool = True
+    params: Mapping[str, Any] | None = None
+    snapshot: bool = False
+    timing: bool | Timing = True
+    group: Group | None = None
+    leave_contact: float = 0.0
+
+    def check(self) -> None:
+        """Check the values that need no robot.
+
+        Raises:
+            ParameterError: One is faulty.
+        """
+        from apex_ompl.planning.departure import LARGEST_DEPTH
+        from apex_ompl.timing import Timing
+
+        check_arguments(self.timeout, self.seed)
+        check_number(self.leave_contact, "leave_contact", 0.0, LARGEST_DEPTH)
+        check_flag(self.simplify, "simplify")
+        check_flag(self.snapshot, "snapshot")
+        if not isinstance(self.timing, (bool, Timing)):
+            raise ParameterError("timing", self.timing, "True, False or a Timing")
+
+
+OPTIONS = tuple(field.name for field in fields(PlanOptions))
+
+
+class PlanKeywords(TypedDict, total=False):
+    """:class:`PlanOptions` as keywords of :meth:`apex_ompl.MotionPlanner.plan`, for editors and type checkers."""
+
+    timeout: float
+    seed: int
+    simplify: bool
+    params: Mapping[str, Any] | None
+    snapshot: bool
+    timing: bool | Timing
+    leave_contact: float
+
+
+class ProblemKeywords(PlanKeywords, total=False):
+    """:class:`PlanOptions` as keywords of :meth:`apex_ompl.MotionPlanner.plan_problem`."""
+
+    group: Group | None
+
+
+def check_arguments(timeout: float, seed: int) -> None:
+    """Check what every plan needs.
+
+    Raises:
+        ParameterError: ``timeout`` is not a positive number of seconds, or ``seed`` not a whole number from 0.
+    """
+    check_positive(timeout, "timeout", "a positive number of seconds")
+    check_seed(seed)
 
 
 @dataclass(frozen=True)
@@ -57,9 +125,9 @@ class MotionPlanner:
     """A robot in a world, ready to plan again and again.
 
     What takes time is done once: the robot is built, its tables and those of the world are made, the model and the
-    compiled code are loaded. The world is edited in place (:class:`apex_ompl.planning.World`), as a planning scene
-    of MoveIt's. A planner may be used by several threads; plans, checks and edits of one planner wait for each other,
-    so that a plan holds for the world in which it began. Two planners work at the same time.
+    compiled code are loaded. The world is edited in place (:class:`apex_ompl.planning.World`), like MoveIt's
+    planning scene. Several threads may use a planner; plans, checks and edits of one planner wait for each other, so
+    that a plan holds for the world in which it started. Two planners work at the same time.
 
         with apex_ompl.MotionPlanner() as planner:
             planner.world.add(name="post", box=(0.1, 0.1, 0.6), position=(0.5, 0.0, 0.3))
@@ -91,12 +159,12 @@ class MotionPlanner:
 
     def _set_up(self) -> None:
         with unforked():
-            import apex_ompl.planning.one_plan  # noqa: F401 - with all that plans need
+            from apex_ompl.planning import departure, query, steps  # noqa: F401 - with all that plans need
         self._checker, self._lock = self.world.checker, self.world.lock
-        self._left: CollisionChecker | None = None  # of the world without some obstacles, as it was needed last
+        self._left: CollisionChecker | None = None  # of the world without some obstacles, from the last call
 
     def __repr__(self) -> str:
-        """Return the robot, the model where one is given, and what is in the world."""
+        """Return the robot, a given model, and the contents of the world."""
         from apex_ompl.apex.parameters import NAME
 
         model = "" if self.model is None else f"model {self.model!r}"
@@ -121,7 +189,7 @@ class MotionPlanner:
         self._set_up()
 
     def plan(
-        self, start: State, goal: Target, planner: str | None = None, *,
+        self, start: State, goal: Target, planner: AnyPlanner | None = None, *,
         group: Group | None = None, name: str = "world", **options: Unpack[PlanKeywords],
     ) -> PlanResult:  # fmt: skip
         """Plan in the world as it is now.
@@ -129,7 +197,7 @@ class MotionPlanner:
         Args:
             start: The start.
             goal: The goal.
-            planner: Name of a planner; see :func:`apex_ompl.plan`.
+            planner: A planner; see :func:`apex_ompl.plan`.
             group: Joints that are planned, by names of groups and joints; the others stay as at the start, and a goal
                 by joint names may leave them out. All by default.
             name: Name of the problem in the result.
@@ -141,36 +209,105 @@ class MotionPlanner:
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
         started = time.perf_counter()
-        from apex_ompl.planning.one_plan import OPTIONS, PlanOptions, plan_once
-
         check_options(options, OPTIONS)
         with running(), self._lock:
-            query = self.problem(start, goal, name, group)
-            return plan_once(self, query, planner, started, PlanOptions(group=group, **options))
+            problem = self.problem(start, goal, name, group, options.get("seed", 0))
+            return self._plan(problem, planner, started, PlanOptions(group=group, **options))
 
     def plan_problem(
-        self, problem: Problem, planner: str | None = None, **options: Unpack[ProblemKeywords]
+        self, problem: Problem, planner: AnyPlanner | None = None, **options: Unpack[ProblemKeywords]
     ) -> PlanResult:
         """Put the bodies of a problem into the world in place of those that are there, and plan.
 
         Args:
             problem: A problem of this robot.
-            planner: Name of a planner.
+            planner: A planner; see :func:`apex_ompl.plan`.
             **options: As of :meth:`plan`, ``group`` among them.
 
         Raises:
             ApexError: The problem, the planner, a parameter or the name of an option is faulty.
         """
         started = time.perf_counter()
-        from apex_ompl.planning.one_plan import OPTIONS, PlanOptions, plan_once
-
         check_options(options, OPTIONS)
         with running(), self._lock:
             with unforked():
                 self.world.load(problem)
-            return plan_once(self, problem, planner, started, PlanOptions(**options))
+            return self._plan(problem, planner, started, PlanOptions(**options))
 
-    def problem(self, start: State, goal: Target, name: str = "world", group: Group | None = None) -> Problem:
+    def _plan(
+        self, problem: Problem, planner: AnyPlanner | None, started: float, options: PlanOptions
+    ) -> PlanResult:  # fmt: skip
+        """Take the five steps of a plan in the world as it is now, while the lock is held.
+
+        Args:
+            problem: The problem, whose bodies are in the world.
+            planner: A planner; apex by default.
+            started: Value of ``time.perf_counter`` when the call started [s].
+            options: The options.
+
+        Raises:
+            ApexError: The planner, a parameter or an option is faulty.
+            KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
+        """
+        from apex_ompl.apex.models import has_model
+        from apex_ompl.apex.parameters import NAME
+        from apex_ompl.collision.conservative import CheckCounts
+        from apex_ompl.ompl.interrupt import Interrupt
+        from apex_ompl.ompl.process import quiet_ompl
+        from apex_ompl.planning import steps
+        from apex_ompl.planning.departure import departed, with_departure
+        from apex_ompl.planning.query import dynamic_of, snapshot_notes
+        from apex_ompl.timing import Timing, warm_up
+
+        options.check()
+        robot, leave_contact = self.robot, options.leave_contact
+        wanted = Timing() if options.timing is True else options.timing
+        timing = wanted if isinstance(wanted, Timing) else None
+        changing = self._checker.changing_obstacles
+        dynamic = () if options.snapshot else dynamic_of(changing)
+        if dynamic:
+            _check_among(dynamic[0], timing, leave_contact)
+        with quiet_ompl(), ExitStack() as preparing:
+            preparing.enter_context(unforked())
+            notes = snapshot_notes(changing) if options.snapshot else []
+            if planner is None and not has_model(robot.name):
+                notes.append(f"no model of {robot.name} ships, so random perturbations take the place of proposals")
+            parameters = planners.chosen(
+                NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
+            )
+            if timing is not None:
+                derivatives = timing.start(timing.limits(robot.limits, robot.joint_names))  # checked before planning
+                if derivatives is not None and leave_contact:
+                    raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
+            checker = self._checker_without({o.name for o in dynamic} if dynamic else self._absent())
+            checker.check_counts = CheckCounts()
+            given = steps.assemble(problem, robot, seed=options.seed, group=options.group, checker=checker)
+            departure, setup = departed(given, leave_contact, options.seed) if leave_contact else (None, given)
+            notes += given.notes
+            notes += [note for note in self._checker.mesh_notes if note not in given.notes]
+            if timing is not None:
+                warm_up()
+            if dynamic:
+                from apex_ompl.planning import among_dynamic_obstacles
+
+                among_dynamic_obstacles.warm_up(checker)
+            times = {"setup": time.perf_counter() - started}
+            query = steps.check(setup, parameters, timeout=options.timeout, started=started, times=times, notes=notes)
+            preparing.close()
+            with Interrupt() as query.interrupt, running(query.interrupt.end):
+                if dynamic and timing is not None:
+                    result = among_dynamic_obstacles.plan_among_dynamic_obstacles(
+                        query, dynamic, options.simplify, timing
+                    )
+                else:
+                    result = steps.time(steps.prove(steps.solve(query), options.simplify), timing or False)
+            if departure is not None:
+                result = steps.finish(query, with_departure(result, given, departure, timing))
+            return result
+
+    def problem(
+        self, start: State, goal: Target, name: str = "world", group: Group | None = None, seed: int = 0
+    ) -> Problem:
         """Return the problem of going from a start to a goal in the world as it is now.
 
         Args:
@@ -178,20 +315,26 @@ class MotionPlanner:
             goal: The goal.
             name: Name of the problem.
             group: Joints that are planned; values of the others are added to a goal by joint names.
+            seed: Seed of a goal that a user's object draws; the states drawn become the goal of the problem.
 
         Raises:
             ParameterError: A state has not the robot's joints.
             UnknownNameError: There is no such group.
         """
-        from apex_ompl.planning.query import goal_record, joint_values, planned_joints
+        import numpy as np
+
+        from apex_ompl.planning.query import GoalSampler, goal_record, joint_values, planned_joints, sampled_goals
         from apex_ompl.scene.problem import Problem
         from apex_ompl.util.schema import validate
 
-        begin = joint_values(self.robot, start, "start")
+        if isinstance(goal, GoalSampler):
+            check_seed(seed)
+            goal = sampled_goals(goal, self.robot, np.random.default_rng(seed), self.is_free)
+        given = joint_values(self.robot, start, "start")
         moving = self.robot.joint_names if group is None else planned_joints(self.robot, group)
-        wanted = goal_record(self.robot, goal, {joint: v for joint, v in begin.items() if joint not in moving})
-        query = validate(Problem, {"name": name, "robot": self.robot_file, "start": begin, "goal": wanted}, "problem")
-        with self._lock:  # what is in the world is valid already
+        wanted = goal_record(self.robot, goal, {joint: v for joint, v in given.items() if joint not in moving})
+        query = validate(Problem, {"name": name, "robot": self.robot_file, "start": given, "goal": wanted}, "problem")
+        with self._lock:  # bodies of the world are valid already
             bodies = {
                 "scene": tuple(self.world.obstacles.values()), "attached": tuple(self.world.held.values()),
                 "allowed": self.world.allowed,
@@ -244,7 +387,7 @@ class MotionPlanner:
         return ready.simple_setup
 
     def _checker_now(self) -> CollisionChecker:
-        """Return a checker of what is there at time 0."""
+        """Return a checker of the world at time 0."""
         return self._checker_without(self._absent())
 
     def _absent(self) -> set[str]:
@@ -261,7 +404,7 @@ class MotionPlanner:
 
         Args:
             names: Names of these obstacles.
-            kept: Whether it may be the one of the last time, in which only what was changed since is changed.
+            kept: Whether the checker of the last call may be reused; it is updated by the changes since then.
         """
         if not names:
             return self._checker
@@ -276,3 +419,49 @@ class MotionPlanner:
         made = CollisionChecker(self.robot, scene.values(), held.values(), pairs)
         self._left = made if kept else self._left
         return made
+
+
+def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:
+    """Check that options go with an obstacle that moves.
+
+    Raises:
+        ParameterError: The motion is not timed, or leaves a contact.
+    """
+    if timing is None:
+        raise ParameterError("timing", False, f"True or a Timing, since the obstacle {obstacle.name!r} moves")
+    if leave_contact:
+        raise ParameterError("leave_contact", leave_contact, f"0, since the obstacle {obstacle.name!r} moves")
+
+
+_idle: dict[str, list[tuple[MotionPlanner, _Stamps]]] = {}
+_idle_lock = ProcessLock()
+
+
+@contextmanager
+def kept_planner(robot: str) -> Iterator[MotionPlanner]:
+    """Lend a planner of a robot, by name or file, that no other thread uses; it is made where there is none.
+
+    A planner is not lent again once a file of its robot has changed, meshes included.
+
+    Raises:
+        ApexError: The robot is unknown, or one of its files is faulty.
+    """
+    key = os.path.abspath(robot) if robot.endswith((".yaml", ".yml")) else robot
+    with _idle_lock:
+        idle = _idle.get(key, [])
+        found = idle.pop() if idle else None
+    if found is None or found[1] != _stamps(found[0]):
+        planner = MotionPlanner(robot)
+        found = planner, _stamps(planner)
+    try:
+        yield found[0]
+    finally:
+        with _idle_lock:
+            mine = _idle.setdefault(key, [])
+            if len(mine) < MOST_IDLE:
+                mine.append(found)
+
+
+def _stamps(planner: MotionPlanner) -> _Stamps:
+    """Return when the files of a planner's robot were written, 0 for one that is gone [ns]."""
+    return tuple(file.stat().st_mtime_ns if file.exists() else 0 for file in planner.robot.files)

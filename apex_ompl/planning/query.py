@@ -1,15 +1,16 @@
-"""Starts and goals as users give them, as records of a problem."""
+"""Input of plans: starts, goals, groups of joints and dynamic obstacles."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Alignment, Goal, PoseTarget
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
@@ -18,12 +19,23 @@ from apex_ompl.util.validation import check_name, finite_array
 State = Mapping[str, float] | ArrayLike
 """A state: values by joint name, or all of them in the robot's order, shape (dof,) [rad; synergies 0..1]."""
 
-Target = State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal
-"""A goal: a state, several of which any will do, shape (goals, dof), poses of one frame or more, an alignment of held
-objects, or the goal of a problem."""
+GOAL_STATES, GOAL_ATTEMPTS = 8, 200  # states that are taken of a user's sampler, and draws for them
+
+
+@runtime_checkable
+class GoalSampler(Protocol):
+    """A goal that a user's object draws states of."""
+
+    def sample(self, rng: np.random.Generator) -> ArrayLike | None:
+        """Return a state that reaches the goal, shape (dof,), or None where this draw finds none."""
+
 
 Group = str | Sequence[str]
 """Joints that a plan moves: name of a group of the robot, or names of groups and joints."""
+
+Target = State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal | GoalSampler
+"""A goal: a state, several of which any will do, shape (goals, dof), poses of one frame or more, an alignment of held
+objects, the goal of a problem, or an object that draws states."""
 
 
 def joint_values(robot: Robot, state: State, name: str) -> dict[str, float]:
@@ -91,6 +103,33 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
     return Goal(joints=tuple(several))
 
 
+def sampled_goals(
+    sampler: GoalSampler, robot: Robot, rng: np.random.Generator, is_free: Callable[[Array], bool]
+) -> list[Array]:  # fmt: skip
+    """Return free states of a sampler, at most GOAL_STATES, or one in collision where none of its states is free.
+
+    Args:
+        sampler: The sampler, which is called GOAL_ATTEMPTS times at most.
+        robot: The robot.
+        rng: Handed to the sampler.
+        is_free: Whether a state is inside the limits and free of collision.
+
+    Raises:
+        ParameterError: A state has not the robot's shape, or there is none.
+    """
+    free, others = list[Array](), list[Array]()
+    for _ in range(GOAL_ATTEMPTS):
+        drawn = sampler.sample(rng)
+        if drawn is not None:
+            q = state_array(robot, drawn, "goal")
+            (free if is_free(q) else others).append(q)
+        if len(free) == GOAL_STATES:
+            break
+    if not free and not others:
+        raise ParameterError("goal", sampler, f"a sampler that returns a state in {GOAL_ATTEMPTS} draws")
+    return free or others[:1]
+
+
 def _several(target: Any) -> Sequence[Any]:
     if isinstance(target, Mapping):
         return [target]
@@ -116,3 +155,26 @@ def planned_joints(robot: Robot, group: Group) -> tuple[str, ...]:
     if not wanted:
         raise ParameterError("group", group, "at least one group or joint")
     return tuple(name for name in robot.joint_names if name in wanted)
+
+
+def dynamic_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
+    """Return the dynamic obstacles, which a plan avoids in time.
+
+    Raises:
+        ParameterError: One does not move at constant velocity from time 0 on.
+    """
+    dynamic = tuple(o for o in obstacles if o.moving)
+    scripted = next((o.name for o in dynamic if o.scripted), None)
+    if scripted is not None:
+        raise ParameterError(
+            "snapshot", False, f"True, since the obstacle {scripted!r} follows a script, which `apex-ompl run` runs"
+        )
+    return dynamic
+
+
+def snapshot_notes(obstacles: Sequence[Obstacle]) -> list[str]:
+    """Return notes on dynamic obstacles, for a plan that takes them as they are at time 0."""
+    later = [o.name for o in obstacles if o.appears > 0.0]
+    still = [o.name for o in obstacles if o.moving and not o.appears > 0.0]
+    notes = ((still, "taken to stand still"), (later, "left out, not there yet"))
+    return [f"snapshot: {', '.join(names)} {what}" for names, what in notes if names]

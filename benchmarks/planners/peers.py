@@ -35,7 +35,7 @@ from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import path_length
-from apex_ompl.planning import NOT_PROVED
+from apex_ompl.planning.steps import NOT_PROVED
 from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix

@@ -238,8 +238,8 @@ def test_another_checker_decides_and_is_reported_once(caplog: pytest.LogCaptureF
 
 
 def test_the_example_with_a_checker_of_its_own_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    text = (ROOT / "examples" / "own_checker.py").read_text()
-    exec(compile(text, "own_checker.py", "exec"), {"__name__": "__main__"})  # noqa: S102
+    text = (ROOT / "examples" / "01_own_checker.py").read_text()
+    exec(compile(text, "01_own_checker.py", "exec"), {"__name__": "__main__"})  # noqa: S102
     assert "EXACT_SOLUTION" in capsys.readouterr().out
 
 

@@ -6,6 +6,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from ompl import base as ob
@@ -14,11 +15,11 @@ from planning import DIFFUSION_ONLY, EXACT, HARD, TIMEOUT, cached_problem, state
 from apex_ompl import plan, planners
 from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.stages import Propose, TakeTurns, shorten
+from apex_ompl.apex.stages import Propose, Solution, TakeTurns, shorten
 from apex_ompl.apex.stages.turns import ITERATIONS
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.path import path_length, resample
+from apex_ompl.paths.path import Path, path_length, resample
 from apex_ompl.planners import APEX
 from apex_ompl.result import INSIDE
 
@@ -192,22 +193,22 @@ class Noted:
     def __init__(self, name: str, on: int = 99) -> None:
         self.name, self.on, self.count = name, on, 0
 
-    def run(self, context: Told, *iterations: int) -> str | None:
+    def run(self, context: Told, *iterations: int) -> Solution | None:
         self.count += 1
         context.done.append((self.name, *iterations))
-        return self.name if self.count == self.on else None
+        return Solution(Path(np.zeros((2, 1))), self.name) if self.count == self.on else None
 
 
 def test_trees_and_rounds_take_turns_by_counts() -> None:
     trees, cold, hot = Noted("trees"), Noted("cold"), Noted("hot", on=2)
     told = Told(100)
-    assert TakeTurns(trees, ((cold,), (hot,))).run(told) == "hot"  # type: ignore[arg-type, comparison-overlap]
+    assert TakeTurns(trees, ((cold,), (hot,))).run(told).stage == "hot"  # type: ignore[arg-type, union-attr]
     stages = [one for one in told.done if one != "pool"]
     assert [one[0] for one in stages] == ["trees", "cold", "trees", "hot"] * 2
     lengths = [one[1] for one in stages if one[0] == "trees"]
     assert lengths[0] == ITERATIONS and all(b > a for a, b in zip(lengths, lengths[1:], strict=False))
     told = Told(100)
-    assert TakeTurns(Noted("trees", on=3), ()).run(told) == "trees"  # type: ignore[arg-type, comparison-overlap]
+    assert TakeTurns(Noted("trees", on=3), ()).run(told).stage == "trees"  # type: ignore[arg-type, union-attr]
     told = Told(5)
     assert TakeTurns(None, ((Noted("x"),),)).run(told) is None and told.done[-1] == "farthest"  # type: ignore[arg-type]
     told = Told(100)

@@ -34,6 +34,7 @@ def run(root: Path) -> list[str]:
         _use_trajectories()
         _use_problems()
         _use_ompl()
+        _use_steps()
         _use_run()
     (Path("tests")).symlink_to(root / "tests")  # data that a page reads
     for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
@@ -89,7 +90,7 @@ def _code(member: Any) -> CodeType | None:
 def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
-    from apex_ompl.planning import check_arguments, kept_planner
+    from apex_ompl.planning.planner import check_arguments, kept_planner
 
     robot = apex_ompl.load_robot("dual_panda_softhand")
     home = robot.home
@@ -192,7 +193,7 @@ def _use_problems() -> None:
     assert problems.primitives(problems.load("unseen/wheels/800001"))
     for name in planners.names():
         assert name in planners.TUNED or planners.parameters(name) is not None
-    assert planners.parameters("rrtconnect").changed(**planners.named({"range": 0.7})).range == 0.7
+    assert planners.parameters("rrtconnect").changed(**{"range": 0.7}).range == 0.7
     space = ob.SpaceInformation(ob.RealVectorStateSpace(2))
     assert planners.make("rrt", space, range=0.1).getName() and planners.allocator("rrt")(space).getName()
     try:
@@ -221,6 +222,26 @@ def _use_ompl() -> None:
     setup.setup()
     assert setup.solve(20.0).getStatus() and planner.report is not None
     setup.clear()
+
+
+def _use_steps() -> None:
+    """The five steps of a plan, and a goal sampler."""
+    import apex_ompl
+    from apex_ompl import planners, planning
+
+    class Home(planning.GoalSampler):
+        def sample(self, rng: np.random.Generator) -> Any:
+            return planner.robot.home + 0.01 if super().sample(rng) is None else None
+
+    with apex_ompl.MotionPlanner() as planner:
+        assert planner.plan(planner.robot.home, Home(), timeout=20.0)
+
+    chosen = planners.chosen("apex", {"first": 4}, seed=3)
+    query = planning.check(planning.assemble(apex_ompl.load_problem("reach_past_post")), chosen, timeout=20.0)
+    assert query and not query.ends_search() and not query.ends()
+    found = planning.solve(query)
+    proved = planning.prove(found)
+    assert found.result().path is not None and proved and planning.time(proved)
 
 
 def _use_run() -> None:

@@ -13,7 +13,7 @@ from ompl import util as ou
 from support import ROOT
 
 import apex_ompl
-from apex_ompl import MotionPlanner, PlanStatus, load_problem, plan, planners, planning
+from apex_ompl import MotionPlanner, PlanStatus, load_problem, plan, planners
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl.process import seed_ompl
@@ -22,6 +22,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.ompl.validity import FullCheck, full_check
 from apex_ompl.paths.path import path_length, resample
+from apex_ompl.planning import steps
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -162,15 +163,15 @@ def test_several_goals_never_hang(planner: str, problem: Problem, tmp_path: Path
 
 @pytest.mark.parametrize("stage", ["shorten", "repair"])
 def test_ctrl_c_after_the_search_is_not_lost(stage: str, problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    honest = getattr(planning.solving, stage)
+    honest = getattr(steps, stage)
 
     def pressed(*args: object) -> object:
         signal.raise_signal(signal.SIGINT)
         return honest(*args)
 
-    monkeypatch.setattr(planning.solving, stage, pressed)
+    monkeypatch.setattr(steps, stage, pressed)
     if stage == "repair":
-        monkeypatch.setattr(planning.solving, "full_check", lambda *_, **__: FullCheck(False, "on purpose", 0))
+        monkeypatch.setattr(steps, "full_check", lambda *_, **__: FullCheck(False, "on purpose", 0))
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         plan(problem, "rrtconnect", timeout=20.0)

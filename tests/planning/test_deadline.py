@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from ompl import base as ob
 
-from apex_ompl import planners, planning
+from apex_ompl import planners
 from apex_ompl.api import load_problem, plan
 from apex_ompl.errors import TimingStoppedError
 from apex_ompl.evaluation import runs
@@ -23,8 +23,9 @@ from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import to_state
 from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
 from apex_ompl.paths.path import Path
-from apex_ompl.planning import NOT_PROVED, PlanRun, find_path, parameterize, solve, straight_line, verify
-from apex_ompl.planning.timing import NOT_TIMED
+from apex_ompl.planning import FoundPath, PlanQuery, ProvedPath, check, prove, solve, steps
+from apex_ompl.planning import time as time_step
+from apex_ompl.planning.steps import NOT_PROVED, NOT_TIMED, straight_line
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.timing import Timing, time_path
 from apex_ompl.util.deadline import Deadline
@@ -66,8 +67,12 @@ def found() -> PlanResult:
     return result
 
 
-def run_of(ready: PlanningSetup, timeout: float = 20.0, planner: str = "rrtconnect") -> PlanRun:
-    return PlanRun(ready, planner, planners.parameters(planner), 3, Deadline(timeout))
+def query_of(ready: PlanningSetup, timeout: float = 20.0, planner: str = "rrtconnect") -> PlanQuery:
+    return check(ready, planner, timeout=timeout)
+
+
+def exact(query: PlanQuery, found: PlanResult) -> FoundPath:
+    return FoundPath(query, PlanStatus.EXACT_SOLUTION, "", found.path, "x")
 
 
 def states_of(found: PlanResult) -> np.ndarray:
@@ -105,21 +110,21 @@ def test_ompl_gets_times_that_it_can_count(seconds: float) -> None:
 
 
 def test_what_comes_late_has_no_time(ready: PlanningSetup) -> None:
-    for find in (straight_line, lambda run: solve(run, True), lambda run: find_path(run, True)):
-        run = run_of(ready)
-        run.deadline.restart(0.0)
-        result = find(run)
+    for find in (straight_line, solve, lambda query: solve(query, lines=False)):
+        query = query_of(ready)
+        query.deadline.restart(0.0)
+        result = find(query)
         assert result is not None and result.status is PlanStatus.TIMEOUT and result.reason == "no path in 20 s"
-        assert "setup" not in run.times, "no planner is built"
+        assert "setup" not in query.times, "no planner is built"
 
 
 def test_a_straight_line_that_is_not_proved_in_time(monkeypatch: pytest.MonkeyPatch) -> None:
     late = FullCheck(False, "not proved in time", None, timed_out=True)
-    monkeypatch.setattr(planning.solving, "full_check", lambda *_, **__: late)
+    monkeypatch.setattr(steps, "full_check", lambda *_, **__: late)
     line = load_problem(PROBLEM)
     near = dict(line.start, left_joint1=line.start["left_joint1"] + 0.01)
     goal = line.goal.model_copy(update={"joints": (near,)})
-    result = straight_line(run_of(assemble(line.model_copy(update={"goal": goal}))))
+    result = straight_line(query_of(assemble(line.model_copy(update={"goal": goal}))))
     assert result is not None and (result.status, result.reason) == (PlanStatus.TIMEOUT, NOT_PROVED)
 
 
@@ -133,12 +138,12 @@ def test_an_expired_proof_is_none(ready: PlanningSetup, found: PlanResult) -> No
 
 @pytest.mark.parametrize("shorten", [True, False])
 def test_a_planner_that_ignores_its_time(shorten: bool, ready: PlanningSetup) -> None:
-    def ignores(run: PlanRun, planner: ob.Planner, timeout: float) -> PlanStatus:
-        status = planning.solving.execute(run, planner, timeout)
-        run.deadline.restart(-1.0)
+    def ignores(query: PlanQuery, planner: ob.Planner, timeout: float) -> PlanStatus:
+        status = steps.execute(query, planner, timeout)
+        query.deadline.restart(-1.0)
         return status
 
-    result = solve(run_of(ready), shorten, ignores)
+    result = prove(solve(query_of(ready), lines=False, execute=ignores), shorten)
     assert (result.status, result.reason, result.path) == (PlanStatus.TIMEOUT, NOT_PROVED, None)
 
 
@@ -165,22 +170,22 @@ def test_a_planner_of_its_own_that_ignores_its_time(how: str) -> None:
 def test_a_repair_without_time_says_so(
     ready: PlanningSetup, found: PlanResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, ends = run_of(ready), list[float]()
+    query, ends = query_of(ready), list[float]()
 
     def fails(*args: Any) -> None:
         ends.append(args[3] - time.perf_counter())
         if spend:
-            run.deadline.restart(-1.0)
+            query.deadline.restart(-1.0)
             monkeypatch.setattr(time, "perf_counter", lambda: args[3])
 
-    monkeypatch.setattr(planning.solving, "full_check", lambda *_, **__: FullCheck(False, "on purpose", 0))
-    monkeypatch.setattr(planning.solving, "repair", fails)
+    monkeypatch.setattr(steps, "full_check", lambda *_, **__: FullCheck(False, "on purpose", 0))
+    monkeypatch.setattr(steps, "repair", fails)
     spend = False
-    result = verify(run, found.path, True, "x")  # type: ignore[arg-type]
+    result = prove(exact(query, found))
     assert result.reason == "the path found failed the full check and repair, on purpose"
     assert len(ends) == 2 and all(8.0 < end <= 10.0 for end in ends), "half of what is left for each"
     spend = True
-    result = verify(run, found.path, False, "x")  # type: ignore[arg-type]
+    result = prove(exact(query, found), False)
     assert (result.status, result.reason) == (PlanStatus.TIMEOUT, NOT_REPAIRED)
 
 
@@ -200,20 +205,20 @@ def test_the_path_as_it_was_found_has_its_turn(
             return full_check(checker, path, *args, **options)  # type: ignore[arg-type]
         return FullCheck(False, "on purpose", 0)
 
-    monkeypatch.setattr(planning.solving, "full_check", check)
-    monkeypatch.setattr(planning.solving, "repair", lambda *_: None)
-    result = verify(run_of(ready), found.path, True, "x")  # type: ignore[arg-type]
-    assert result and np.array_equal(states_of(result), states_of(found))
+    monkeypatch.setattr(steps, "full_check", check)
+    monkeypatch.setattr(steps, "repair", lambda *_: None)
+    result = prove(exact(query_of(ready), found))
+    assert result and result.path is not None and np.array_equal(result.path.states, states_of(found))
 
 
 def test_without_time_nothing_is_shortened(
     ready: PlanningSetup, found: PlanResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = run_of(ready)
-    run.deadline.restart(0.5 * run.deadline.reserve)
-    monkeypatch.setattr(planning.solving, "shorten", lambda *_: pytest.fail("it was shortened"))
-    result = verify(run, found.path, True, "x")  # type: ignore[arg-type]
-    assert result and np.array_equal(states_of(result), states_of(found))
+    query = query_of(ready)
+    query.deadline.restart(0.5 * query.deadline.reserve)
+    monkeypatch.setattr(steps, "shorten", lambda *_: pytest.fail("it was shortened"))
+    result = prove(exact(query, found))
+    assert result and result.path is not None and np.array_equal(result.path.states, states_of(found))
 
 
 def counting(limit: int) -> Callable[[], bool]:
@@ -254,21 +259,20 @@ def test_shortening_ends_in_time(ready: PlanningSetup, found: PlanResult) -> Non
 def test_a_path_that_is_not_timed_in_time(
     ready: PlanningSetup, found: PlanResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = run_of(ready)
-    exact = run.result(PlanStatus.EXACT_SOLUTION, path=found.path)
-    run.deadline.restart(0.0)
-    result = parameterize(run, exact, Timing())
+    query = query_of(ready)
+    query.deadline.restart(0.0)
+    result = time_step(ProvedPath(query, PlanStatus.EXACT_SOLUTION, "", found.path))
     assert (result.status, result.reason) == (PlanStatus.TIMEOUT, NOT_TIMED)
-    assert result.path is found.path and result.trajectory is None and run.times["timing"] >= 0.0
+    assert result.path is found.path and result.trajectory is None and query.times["timing"] >= 0.0
 
     def ends(checker: object, motion: object, start: object, goals: object, *, deadline: float) -> FullCheck:
-        assert deadline == run.deadline.at
-        run.deadline.restart(0.0)
+        assert deadline == query.deadline.at
+        query.deadline.restart(0.0)
         return FullCheck(False, "not proved in time", None, timed_out=True)
 
-    run = run_of(ready)
-    monkeypatch.setattr(planning.timing, "full_check", ends)
-    result = parameterize(run, exact, Timing())
+    query = query_of(ready)
+    monkeypatch.setattr(steps, "full_check", ends)
+    result = time_step(ProvedPath(query, PlanStatus.EXACT_SOLUTION, "", found.path))
     assert (result.status, result.reason) == (PlanStatus.TIMEOUT, NOT_TIMED)
 
 

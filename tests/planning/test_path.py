@@ -20,8 +20,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.path import Path
 from apex_ompl.paths.spline import Spline
 from apex_ompl.planners import APEX
-from apex_ompl.planning import PlanRun, solve, straight_line
-from apex_ompl.util.deadline import Deadline
+from apex_ompl.planning import steps
 
 
 @pytest.mark.parametrize("spline", [Spline(), Spline(22, 3, 100), Spline(8, 2, 33, 3)])
@@ -101,9 +100,9 @@ def test_the_straight_line_is_tried_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
     monkeypatch.setattr(CollisionChecker, "prove", counting)
     monkeypatch.setattr(CollisionChecker, "collides_along", counting_quick)
-    run = PlanRun(ready, "apex", ApexParameters(sprint=0), 0, Deadline(20.0))
-    assert straight_line(run) is None and lines == 1
-    assert solve(run, True) and lines == 1
+    query = steps.check(ready, ApexParameters(sprint=0, seed=0), timeout=20.0)
+    assert steps.straight_line(query) is None and lines == 1
+    assert steps.prove(steps.solve(query, lines=False)) and lines == 1
     setup = assemble(cached_problem(HARD)).simple_setup
     setup.setPlanner(APEX(setup.getSpaceInformation(), ApexParameters(sprint=0, seed=0)))
     assert setup.solve(20.0) and lines == 2

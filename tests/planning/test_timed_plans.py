@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apex_ompl import api, cli, plan, planners, planning
+from apex_ompl import api, cli, plan, planning
 from apex_ompl.errors import ParameterError, TimingError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path as JointPath
+from apex_ompl.planning import steps
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.timing import Timing, Trajectory, time_path
-from apex_ompl.util.deadline import Deadline
 
 
 def test_plans_are_timed_and_checked() -> None:
@@ -50,16 +50,16 @@ def test_joints_at_their_limits_do_not_stop_a_plan() -> None:
     states[:, 6], states[:, 13] = robot.limits.upper[6], robot.limits.lower[13]
     states[:, 5] += 0.2 * np.sin(5.0 * np.linspace(0.0, 1.0, 256))
     ready = replace(ready, start=states[0], goals=states[-1:])
-    run = planning.PlanRun(ready, "rrtconnect", planners.parameters("rrtconnect"), 0, Deadline(20.0))
-    exact = run.result(PlanStatus.EXACT_SOLUTION, path=JointPath(states))
-    assert planning.parameterize(run, exact, Timing()).trajectory.duration < 5.0
+    query = planning.check(ready, "rrtconnect", timeout=20.0)
+    proved = planning.ProvedPath(query, PlanStatus.EXACT_SOLUTION, "", JointPath(states))
+    assert planning.time(proved).trajectory.duration < 5.0
 
 
 def test_a_path_that_cannot_be_timed_is_no_success(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*args: object, **options: object) -> None:
         raise TimingError("the motion collides")
 
-    monkeypatch.setattr(planning.timing, "time_path", fails)
+    monkeypatch.setattr(steps, "time_path", fails)
     result = plan("ball_in_cup", timeout=20.0)
     assert result.status is PlanStatus.TIMING_FAILED and not result and result.path is not None
     assert result.reason == "the path cannot be timed, the motion collides" and result.trajectory is None

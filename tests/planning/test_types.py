@@ -10,17 +10,24 @@ from pathlib import Path
 import pytest
 from support import ROOT
 
-from apex_ompl.planning.one_plan import PlanKeywords, PlanOptions, ProblemKeywords
+from apex_ompl import Obstacle
+from apex_ompl.apex.parameters import ApexKeywords, ApexParameters
+from apex_ompl.planning.planner import PlanKeywords, PlanOptions, ProblemKeywords
+from apex_ompl.planning.world import ObstacleFields
 
-SOURCES = ("api.py", "loop/run.py", "planning/one_plan.py", "planning/planner.py")
+SOURCES = (
+    "api.py", "loop/run.py", "planning/planner.py", "planning/world.py", "apex/planner.py", "apex/parameters.py",
+    "ompl/parameters.py",
+)  # fmt: skip
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
 USE = """
-from apex_ompl.api import plan
 from apex_ompl import run
+from apex_ompl.api import plan
+from apex_ompl.apex.planner import APEX
 from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.planning.planner import MotionPlanner
 
-def use(planner: MotionPlanner, problem: Problem) -> None:
+def use(planner: MotionPlanner, problem: Problem, si: object) -> None:
     planner.plan([0.0], [1.0], timeout=3.0, timing=False, group="left_arm", leave_contact=0.001)
     planner.plan([0.0], [1.0], timeot=3)
     planner.plan([0.0], [1.0], seed="one")
@@ -28,12 +35,27 @@ def use(planner: MotionPlanner, problem: Problem) -> None:
     plan("shelf_swap", timeot=3)
     run("popup", planer="apex")
     PoseTarget(frame="left_hand_palm", positon=(0.5, 0.2, 0.4))
+    planner.world.add(name="ball", sphere={"radius": 0.1}, position=(0.5, 0.0, 0.3))
+    planner.world.add(nam="ball", box=(0.1, 0.1, 0.1))
+    APEX(si, first=4, stages=())
+    APEX(si, frist=4)
 """
-REFUSED = {9: '"timeot"', 10: '"seed"', 11: '"sed"', 12: '"timeot"', 13: '"planer"', 14: '"position"'}  # by line
+REFUSED = {
+    10: '"timeot"',
+    11: '"seed"',
+    12: '"sed"',
+    13: '"timeot"',
+    14: '"planer"',
+    15: '"position"',
+    17: '"nam"',
+    19: '"frist"',
+}  # by line
 
 
 def test_keywords_are_those_that_plans_take() -> None:
     names = {field.name for field in fields(PlanOptions)}
+    assert set(ApexKeywords.__annotations__) == {field.name for field in fields(ApexParameters)}
+    assert set(ObstacleFields.__annotations__) == set(Obstacle.model_fields)
     assert set(ProblemKeywords.__annotations__) == names and set(PlanKeywords.__annotations__) == names - {"group"}
 
 

@@ -48,7 +48,7 @@ def is_there(name: str) -> bool:
 
 def test_readme_is_short_and_its_example_runs_as_printed(tmp_path: Path) -> None:
     code, script = CODE[ROOT / "README.md"]
-    assert (ROOT / "examples" / "own_checker.py").read_text().endswith(script), "which another test runs"
+    assert (ROOT / "examples" / "01_own_checker.py").read_text().endswith(script), "which another test runs"
     assert len(code.strip().splitlines()) <= 12
     assert len(README.split()) < 800
     done = subprocess.run(
@@ -150,7 +150,7 @@ def test_scripts_say_how_they_are_used(script: str) -> None:
 
 
 def test_the_ompl_example_runs(tmp_path: Path) -> None:
-    example = ROOT / "examples" / "ompl_benchmark.py"
+    example = ROOT / "examples" / "06_ompl_benchmark.py"
     command = [sys.executable, example, "reach_past_post", "--runs", "1", "--timeout", "8"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -5,12 +5,11 @@ chosen by ``apex_ompl.apex.parameters.ApexParameters.stages``.
 """
 
 from apex_ompl.apex.stages.anytime import Anytime
-from apex_ompl.apex.stages.bridging import Bridging
+from apex_ompl.apex.stages.bridging import Bridging, NearestToGoal
 from apex_ompl.apex.stages.known import CheckKnown, KnownCandidates
-from apex_ompl.apex.stages.nearest import NearestToGoal
 from apex_ompl.apex.stages.proposals import Farthest, Propose, Repair, Resample, proposal_round
 from apex_ompl.apex.stages.shorten import Shorten
-from apex_ompl.apex.stages.stage import Solution, Stage
+from apex_ompl.apex.stages.stage import Solution, Stage, run_stage
 from apex_ompl.apex.stages.trees import GrowTrees, Sprint
 from apex_ompl.apex.stages.turns import TEMPERATURES, TakeTurns
 
@@ -32,4 +31,5 @@ __all__ = [
     "Stage",
     "TakeTurns",
     "proposal_round",
+    "run_stage",
 ]

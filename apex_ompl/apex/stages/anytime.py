@@ -22,17 +22,17 @@ VARIED = 4  # variations of a path at a time
 
 @dataclass(frozen=True)
 class Anytime:
-    """Look for shorter paths, until time is up or the path length objective is satisfied.
+    """Search for shorter paths until time is up or the path length objective is satisfied.
 
     Attributes:
-        asked: Whether to look at all. An objective alone does not ask for it: BIT* and RRT* of OMPL leave one in the
-            problem definition that they share with other planners of a ``Benchmark``.
+        asked: Whether to improve paths at all. An objective alone does not ask for it: BIT* and RRT* of OMPL leave one
+            in the problem definition that they share with other planners of a ``Benchmark``.
     """
 
     asked: bool
 
     def run(self, context: SolveContext) -> None:
-        """Accept what is shorter until time is up, or the objective is satisfied."""
+        """Accept shorter paths until time is up, or the objective is satisfied."""
         pdef = context.pdef
         objective = pdef.getOptimizationObjective() if pdef.hasOptimizationObjective() else None
         if not self.asked:

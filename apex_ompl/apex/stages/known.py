@@ -16,7 +16,7 @@ LINE, EXPERIENCE = "line", "experience"
 
 @dataclass(frozen=True)
 class KnownCandidates:
-    """Check the straight lines, and earlier paths moved to other ends; what is invalid waits for repair.
+    """Check the straight lines, and earlier paths moved to other ends; invalid ones wait for repair.
 
     Attributes:
         line: Whether straight lines are candidates.

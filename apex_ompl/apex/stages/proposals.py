@@ -12,10 +12,10 @@ from apex_ompl.apex.stages.stage import Solution, Stage, solution_of
 from apex_ompl.types import Array
 
 PROPOSED, RESAMPLED = "apex", "apex+resample"
-BATCH = 8  # proposals between two looks at the clock
+BATCH = 8  # proposals between two checks of the clock
 MIN_REPAIR_STEPS = 48  # of repair in a round
-STEPS_PER_PROPOSAL = 8  # likewise, on average
-SHORT_REPAIR_STEPS = 24  # of a short repair before it
+STEPS_PER_PROPOSAL = 8  # of repair in a round, on average
+SHORT_REPAIR_STEPS = 24  # of the short repair before it
 MAX_RESAMPLED = 4  # candidates that are resampled in a round
 
 

@@ -18,14 +18,14 @@ from apex_ompl.types import Array
 DETOUR, OTHERS = 1.7, 2  # times the straight line's length, beyond which so many other trees are tried
 ITERATIONS = 6_000  # of each of these
 MOTIONS = 500  # that are checked to cut a polyline short where another checker decides
-PASSES, IDLE, MIN_GAIN = 4, 2, 0.02  # over such a path; so many that shorten by less than this share are the last
+PASSES, IDLE, MIN_GAIN = 4, 2, 0.02  # over such a path; it ends after IDLE that shorten by less than MIN_GAIN
 
 
 @dataclass(frozen=True)
 class Shorten:
     """Shorten the best path; a polyline is cut short, and fitted by a spline, before it is optimized.
 
-    A polyline that stays far longer than the straight line goes a long way round: others are looked for by trees.
+    Where a polyline stays much longer than the straight line, new trees search for a shorter one.
     Where another checker decides, whose obstacles the optimizer does not know, cutting and optimizing take turns.
 
     Attributes:
@@ -35,7 +35,7 @@ class Shorten:
     tree_range: float | None = None
 
     def run(self, context: SolveContext) -> None:
-        """Accept what is shorter."""
+        """Accept shorter paths."""
         if context.best is None or context.stop():
             return
         if context.validator.exclusive:
@@ -61,7 +61,7 @@ class Shorten:
         return context.fit(found[0])
 
     def _cut_short(self, context: SolveContext, states: Array) -> list[Array]:
-        """Return a polyline, and others in its place where it goes a long way round, cut short; the shortest first."""
+        """Return a polyline after shortcuts, and others where it takes a detour; the shortest first."""
         found = [_shortcut(context, states)]
         if self.tree_range is None:
             return found

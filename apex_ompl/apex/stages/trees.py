@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.apex.bridge import bridge_blocked
 from apex_ompl.apex.context import SolveContext, joins
+from apex_ompl.apex.stages.bridging import bridge_blocked
 from apex_ompl.apex.stages.stage import Solution
 from apex_ompl.apex.trees import OMPL_SHARE, grow, rooted_ompl_trees, rooted_trees
 from apex_ompl.ompl.space import path_to_array

@@ -7,7 +7,7 @@ from itertools import count
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.proposals import Farthest
-from apex_ompl.apex.stages.stage import Solution, Stage
+from apex_ompl.apex.stages.stage import Solution, Stage, run_stage
 from apex_ompl.apex.stages.trees import GrowTrees
 
 TEMPERATURES = (1.6, 2.0, 2.4)
@@ -48,7 +48,7 @@ class TakeTurns:
         for stage in stages:
             if context.stop():
                 return None
-            found = stage.run(context)
+            found = run_stage(stage, context)
             if found is not None:
                 return found
         return None

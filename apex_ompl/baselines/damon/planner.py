@@ -17,7 +17,7 @@ from apex_ompl.baselines.damon.manifold import shared_manifold
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.parameters import Parameters, bounded, one_of, register
-from apex_ompl.ompl.space import array_to_path, motions_free
+from apex_ompl.ompl.space import motions_free
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import Path
 from apex_ompl.types import Array, Flags
@@ -78,11 +78,8 @@ class DAMON(OwnPlanner):
             self.report.reason = f"no path over {used} by {search.searches} searches"
             self.report.reason += " in the time given" if ptc() else ", and none is left"
             return Status.TIMEOUT
-        self.report.solved_by, self.report.first = NAME, time.perf_counter() - started
-        self.report.first_path = self.report.best_path = Path(path)
-        self.report.lengths.append((self.report.first, self.report.best_path.length))
-        si = self.getSpaceInformation()
-        self.getProblemDefinition().addSolutionPath(array_to_path(si, path), False, 0.0, NAME)
+        self.report.solved_by = NAME
+        self.report.add_solution(self, Path(path), time.perf_counter() - started)
         return Status.EXACT_SOLUTION
 
     def _nodes(self, states: Array) -> tuple[Flags, Flags]:

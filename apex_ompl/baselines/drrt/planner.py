@@ -17,7 +17,7 @@ from apex_ompl.collision.changes import may_have_become_blocked
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
 from apex_ompl.ompl.parameters import Parameters, bounded, register
-from apex_ompl.ompl.space import array_to_path, motions_free, require_real_vectors
+from apex_ompl.ompl.space import motions_free, require_real_vectors
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker
 from apex_ompl.paths.path import Path
@@ -90,10 +90,8 @@ class DRRT(OwnPlanner):
         if path is None:
             self.report.reason = f"no path by a tree of {len(tree)} nodes in the time given"
             return Status.TIMEOUT
-        self.report.solved_by, self.report.first = NAME, time.perf_counter() - started
-        self.report.first_path = self.report.best_path = Path(path)
-        self.report.lengths.append((self.report.first, self.report.best_path.length))
-        self.getProblemDefinition().addSolutionPath(array_to_path(si, path), False, 0.0, NAME)
+        self.report.solved_by = NAME
+        self.report.add_solution(self, Path(path), time.perf_counter() - started)
         return Status.EXACT_SOLUTION
 
     def _trim(self, tree: GoalTree) -> None:

@@ -21,7 +21,7 @@ from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.parameters import Parameters, bounded, register
-from apex_ompl.ompl.space import array_to_path, bounds_of
+from apex_ompl.ompl.space import bounds_of
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import Path
 from apex_ompl.types import Array
@@ -233,7 +233,8 @@ class GaussianProcessPlanner(OwnPlanner):
                 proved = proof is None or bool(proof)
                 valid = proved and validator.accepts(path.states, lambda: bool(ptc()))
             if valid:
-                self._add(path, time.perf_counter() - started)
+                report.solved_by, report.first_verified, report.reason = self.parameters.name, True, ""
+                report.add_solution(self, path, time.perf_counter() - started)
                 return Status.EXACT_SOLUTION
             report.reason = report.reason or (
                 NOT_ACCEPTED if proof is None or proved else self._fault(path, proof, optimum)
@@ -255,14 +256,6 @@ class GaussianProcessPlanner(OwnPlanner):
             for _ in range(drawn):
                 for line in rest:
                     yield process.sample(line, rng, self.parameters.restart_size)
-
-    def _add(self, path: Path, seconds: float) -> None:
-        report, name = self.report, self.parameters.name
-        report.solved_by, report.first, report.first_verified, report.reason = name, seconds, True, ""
-        report.first_path = report.best_path = path
-        report.lengths.append((seconds, path.length))
-        solution = array_to_path(self.getSpaceInformation(), path.states)
-        self.getProblemDefinition().addSolutionPath(solution, False, 0.0, name)
 
     def _fault(self, path: Path, proof: PathProof, optimum: Optimum) -> str:
         """Return which constraint the path violates, where and how deep, and how the optimization ended."""

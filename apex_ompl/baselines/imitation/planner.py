@@ -15,7 +15,7 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.parameters import Parameters, bounded, register
-from apex_ompl.ompl.space import array_to_path, bounds_of, to_state
+from apex_ompl.ompl.space import bounds_of, to_state
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
@@ -82,11 +82,8 @@ class ImitationPlanner(OwnPlanner):
             if found is None:
                 continue
             path, report.solved_by = found
-            report.first = time.perf_counter() - started
-            report.first_verified, report.first_path, report.best_path = True, path, path
-            report.lengths.append((report.first, path.length))
-            solution = array_to_path(self.getSpaceInformation(), path.states)
-            self.getProblemDefinition().addSolutionPath(solution, False, 0.0, self._name)
+            report.first_verified = True
+            report.add_solution(self, path, time.perf_counter() - started)
             return Status.EXACT_SOLUTION
         report.reason = "; ".join(dict.fromkeys(reasons))
         if not ptc():

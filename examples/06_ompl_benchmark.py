@@ -3,7 +3,7 @@
 ``apex_ompl.setup`` gives a SimpleSetup with space, checkers, start and goal in place, so everything that OMPL's
 documentation says of SimpleSetup works on it.
 
-Usage: python examples/ompl_benchmark.py [PROBLEM] [--runs 3] [--timeout 5] [--log FILE]
+Usage: python examples/06_ompl_benchmark.py [PROBLEM] [--runs 3] [--timeout 5] [--log FILE]
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Ask the model for paths, repair them, and see which are solutions.
 
-Usage: python examples/propose.py [PROBLEM] [--count 8]
+Usage: python examples/07_propose.py [PROBLEM] [--count 8]
 """
 
 from __future__ import annotations

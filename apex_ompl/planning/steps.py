@@ -1,0 +1,485 @@
+"""The five steps of a plan: assemble, check, solve, prove, time.
+
+Each step takes what the one before it returned::
+
+    setup = assemble(problem)  # robot, checker, state space, start and goals
+    query = check(setup, "apex", timeout=5.0)  # true where the start and a goal are valid; the time starts
+    found = solve(query)  # a path at the search resolution, with the planner's spline
+    proved = prove(found)  # the path that passed the full check, with its certificate
+    result = time(proved)  # the timed motion, and all that ``apex_ompl.plan`` returns
+
+A step hands a failure on with its status and reason, so that they can be called in a row. The timeout covers all steps
+after ``check``.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import nan
+from typing import Any
+
+import numpy as np
+from ompl import base as ob
+
+from apex_ompl import planners
+from apex_ompl.apex.parameters import NAME
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_proof import PathProof
+from apex_ompl.errors import ApexError, TimingError, TimingStoppedError
+from apex_ompl.ompl import setup as ompl_setup
+from apex_ompl.ompl.interrupt import MAX_TIME, Interrupt, ends_after
+from apex_ompl.ompl.own_planner import SolveReport, reporting
+from apex_ompl.ompl.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.setup import PlanningSetup, set_goals
+from apex_ompl.ompl.simplify import simplify as shorten
+from apex_ompl.ompl.space import path_to_array
+from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
+from apex_ompl.paths.path import Path
+from apex_ompl.planners import AnyPlanner, Parameters
+from apex_ompl.planning.departure import remedy
+from apex_ompl.planning.query import Group, planned_joints
+from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
+from apex_ompl.robot import Robot, load_robot
+from apex_ompl.robot.identity import digest
+from apex_ompl.scene.problem import Problem
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.trajectory import ROUNDING
+from apex_ompl.types import Array
+from apex_ompl.util.deadline import Deadline
+from apex_ompl.util.display import one_line
+from apex_ompl.util.forking import unforked
+from apex_ompl.util.stopwatch import timed
+from apex_ompl.util.validation import check_positive
+
+STRAIGHT_LINE = "straight line"
+UNNAMED = "unnamed"  # planner of a user's function before it is made
+NOT_PROVED = "a path was found but not proved in time"
+NOT_TIMED = "a path was found but not timed in time"
+REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
+
+
+@dataclass(eq=False)
+class PlanQuery:
+    """What ``check`` returns: a problem that is set up, a planner, and the time that it has.
+
+    True where the start and at least one goal are valid.
+
+    Attributes:
+        setup: The problem.
+        planner: Name of the planner.
+        parameters: Its parameters.
+        deadline: When the plan is to be ready.
+        status: INVALID_START or INVALID_GOAL, or None.
+        reason: Why it is one of these, in one sentence.
+        started: Value of ``time.perf_counter`` when the call of ``plan`` started [s].
+        times: Seconds by stage so far.
+        notes: What a user should know about this plan.
+        interrupt: Holds Ctrl-C back.
+        rejected_lines: Straight lines to goals that failed the full check, each of shape (2, dof).
+        first_path: First path that the planner found, or None.
+        report: Report of the planner, of planners that make one.
+    """
+
+    setup: PlanningSetup
+    planner: str
+    parameters: Parameters
+    deadline: Deadline
+    status: PlanStatus | None = None
+    reason: str = ""
+    started: float = 0.0
+    times: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    interrupt: Interrupt = field(default_factory=Interrupt)
+    rejected_lines: list[Array] = field(default_factory=list)
+    first_path: Path | None = None
+    report: SolveReport | None = None
+
+    def __bool__(self) -> bool:
+        """Whether the start and at least one goal are valid."""
+        return self.status is None
+
+    def __repr__(self) -> str:
+        """Return the problem, the planner and what is wrong."""
+        return one_line("PlanQuery", repr(self.setup.problem.name), self.planner, self.reason or "valid")
+
+    def ends_search(self) -> bool:
+        """Whether only the reserve for the proof is left, or Ctrl-C was pressed."""
+        return self.interrupt.pressed or self.deadline.for_search <= 0.0
+
+    def ends(self) -> bool:
+        """Whether no time is left, or Ctrl-C was pressed."""
+        return self.interrupt.pressed or self.deadline.expired
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPath:
+    """What ``solve`` returns: a path at the search resolution, or why there is none.
+
+    True where the path leads from the start to a goal.
+
+    Attributes:
+        query: The query.
+        status: OMPL's name of the outcome.
+        reason: Why it is no exact solution, in one sentence.
+        path: The path, with the planner's spline where it has one, or None.
+        solved_by: What found the path, see :class:`apex_ompl.PlanResult`.
+        proof: Certificate of the path; the straight line has one before the planner runs.
+    """
+
+    query: PlanQuery
+    status: PlanStatus
+    reason: str = ""
+    path: Path | None = None
+    solved_by: str = ""
+    proof: PathProof | None = None
+
+    def __bool__(self) -> bool:
+        """Whether there is a path from the start to a goal."""
+        return self.status is PlanStatus.EXACT_SOLUTION
+
+    def __repr__(self) -> str:
+        """Return the status and what was found."""
+        path = "" if self.path is None else f"{self.path.length:.3f} rad over {len(self.path)} states"
+        return one_line(type(self).__name__, str(self.status), self.solved_by, path, self.reason)
+
+    def result(self) -> PlanResult:
+        """Return a result without motion, and without what :func:`finish` adds."""
+        query, robot, proof = self.query, self.query.setup.robot, self.proof
+        result = PlanResult(
+            status=self.status, reason=self.reason, problem=query.setup.problem, robot=robot.name,
+            joint_names=robot.joint_names, planner=query.planner, seed=query.setup.seed, path=self.path,
+            solved_by=self.solved_by, notes=tuple(query.notes),
+            held_joints=tuple(robot.joint_names[k] for k in query.setup.held),
+            robot_digest=digest(robot),
+        )  # fmt: skip
+        if proof is None:
+            return result
+        return replace(
+            result, clearance=proof.clearance, clearance_bound=proof.clearance_bound, clearance_pair=proof.pair,
+            proved_by_spheres=proof.by_spheres,
+        )  # fmt: skip
+
+
+class ProvedPath(FoundPath):
+    """What ``prove`` returns: a path that passed the full check, or why there is none."""
+
+
+Execute = Callable[[PlanQuery, ob.Planner, float], PlanStatus]
+"""Runs a planner that is set, for a time [s], and returns its status."""
+
+
+def assemble(
+    problem: Problem, robot: Robot | None = None, *, seed: int = 0, group: Group | None = None,
+    checker: CollisionChecker | None = None,
+) -> PlanningSetup:  # fmt: skip
+    """Make a problem ready: robot, collision checker, state space, start and goals, and OMPL's seed.
+
+    Args:
+        problem: The problem; dynamic obstacles stand where they are at time 0, if they are there then.
+        robot: Its robot, when it is loaded already.
+        seed: Seed of all random numbers of the plan, OMPL's among them.
+        group: Joints that are planned, by names of groups and joints; the others stay as at the start. All by default.
+        checker: Collision checker that has the bodies of the problem already.
+
+    Raises:
+        ApexError: The robot, a mesh or a joint of the problem is unknown or faulty.
+    """
+    robot = robot or load_robot(problem.robot)
+    moving = None if group is None else planned_joints(robot, group)
+    seed_ompl(seed)
+    return ompl_setup.assemble(problem, robot, seed=seed, checker=checker, moving=moving)
+
+
+def check(
+    setup: PlanningSetup, planner: AnyPlanner = NAME, *, params: Mapping[str, Any] | None = None, timeout: float = 5.0,
+    started: float | None = None, times: Mapping[str, float] | None = None, notes: Sequence[str] = (),
+) -> PlanQuery:  # fmt: skip
+    """Check the start, the goals and the planner's parameters, and start the time of the plan.
+
+    Args:
+        setup: What :func:`assemble` returned.
+        planner: Name of a planner, its parameters, or a function that makes one for OMPL's space information.
+        params: Parameters of the planner by name.
+        timeout: Seconds for the steps that follow.
+        started: Value of ``time.perf_counter`` when the call of ``plan`` started, by default now [s].
+        times: Seconds by stage so far.
+        notes: What a user should know about this plan.
+
+    Raises:
+        ApexError: The planner or a parameter is unknown or faulty.
+    """
+    check_positive(timeout, "timeout", "a positive number of seconds")
+    started = clock.perf_counter() if started is None else started
+    parameters = planners.chosen(planner, params, seed=setup.seed)
+    status, reason = query_fault(setup)
+    name, spent = parameters.name or UNNAMED, dict(times or {})
+    return PlanQuery(setup, name, parameters, Deadline(timeout), status, reason, started, spent, list(notes))
+
+
+def query_fault(setup: PlanningSetup) -> tuple[PlanStatus | None, str]:
+    """Return the status and the reason of an invalid start, or of goals that are all invalid; else None."""
+    if setup.start_fault:
+        return PlanStatus.INVALID_START, setup.start_fault + remedy(setup)
+    if all(setup.goal_faults):
+        return PlanStatus.INVALID_GOAL, "; ".join(setup.goal_faults)
+    return None, ""
+
+
+def execute(query: PlanQuery, planner: ob.Planner, timeout: float) -> PlanStatus:
+    """Run a planner that is set, and return its status; faults of the checkers are raised."""
+    del planner
+    with query.interrupt.ends(ends_after(timeout)) as ptc, timed(query.times, "solve"):
+        status = PlanStatus.of(query.setup.simple_setup.solve(ptc))
+    query.setup.raise_faults()
+    return status
+
+
+def solve(query: PlanQuery, *, lines: bool = True, execute: Execute = execute) -> FoundPath:
+    """Return the straight line to a goal where it is a solution, or else the path that the planner finds.
+
+    The planner has what time is left but for the reserve; its set-up does not count.
+
+    Args:
+        query: What :func:`check` returned.
+        lines: Whether straight lines are tried before the planner runs.
+        execute: Runs the planner.
+
+    Raises:
+        ApexError: The planner cannot be built; a checkpoint is missing, for one.
+    """
+    if query.status is not None:
+        return FoundPath(query, query.status, query.reason)
+    found = straight_line(query) if lines else None
+    if found is not None:
+        return found
+    if query.deadline.expired:
+        return _out_of_time(query)
+    try:
+        with quiet_ompl():
+            return _searched(query, execute)
+    except ApexError:
+        raise
+    except Exception as error:
+        return FoundPath(query, PlanStatus.CRASH, f"{query.planner} failed, {error!r}")
+
+
+def straight_line(query: PlanQuery) -> FoundPath | None:
+    """Return the straight line to the nearest goal for which it is a solution, or that time is up, or else None.
+
+    Some of OMPL's planners hang, give up or raise where there is nothing to search for.
+    """
+    setup = query.setup
+    with timed(query.times, "line"):
+        for goal in sorted(setup.valid_goals, key=lambda goal: float(np.linalg.norm(goal - setup.start))):
+            if query.deadline.expired:
+                return _out_of_time(query)
+            line = np.stack([setup.start, goal])
+            if setup.checker.collides_along(line):
+                query.rejected_lines.append(line)
+                continue
+            check = full_check(setup.checker, line, setup.start, setup.goals, deadline=query.deadline.at)
+            if check:
+                return FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(line), STRAIGHT_LINE, check.proof)
+            if check.timed_out:
+                return FoundPath(query, PlanStatus.TIMEOUT, NOT_PROVED)
+            query.rejected_lines.append(line)
+    return None
+
+
+def prove(found: FoundPath, simplify: bool = True) -> ProvedPath:
+    """Put the exact start and goal in, shorten the path, check it in full, and repair it where it fails.
+
+    When a shortened path neither passes nor can be repaired, the path as it was found has its turn; each repair has
+    half of the time that is left. A path that ends near a goal is checked as it is.
+
+    Args:
+        found: What :func:`solve` returned.
+        simplify: Whether paths of planners that leave it to others are shortened.
+    """
+    query = found.query
+    if found.path is None or found.proof is not None:
+        return ProvedPath(query, found.status, found.reason, found.path, found.solved_by, found.proof)
+    try:
+        with quiet_ompl():
+            return _verified(found, found.path, simplify) if found else _checked(found, found.path)
+    except ApexError:
+        raise
+    except Exception as error:
+        return ProvedPath(query, PlanStatus.CRASH, f"{query.planner} failed, {error!r}")
+
+
+def time(proved: ProvedPath, timing: bool | Timing = True) -> PlanResult:
+    """Return the result of a plan: the path timed, or with the status TIMEOUT or TIMING_FAILED.
+
+    The motion keeps the limits and is proved free along its own cubic pieces.
+
+    Args:
+        proved: What :func:`prove` returned; without an exact path nothing is timed.
+        timing: How the path is timed, or whether.
+    """
+    result = proved.result()
+    how = Timing() if timing is True else timing
+    if isinstance(how, Timing) and proved and proved.path is not None:
+        result = _timed(proved.query, proved.path, how, result)
+    return finish(proved.query, result)
+
+
+def finish(query: PlanQuery, result: PlanResult) -> PlanResult:
+    """Return a result with its length, the number of states that were checked, and the times up to now."""
+    length = nan if result.path is None else result.path.length
+    times = {**query.times, "total": clock.perf_counter() - query.started}
+    return replace(result, length=length, checks=query.setup.checker.check_counts.states, times=times)
+
+
+def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:
+    """Return a path whose ends are the given start and the nearest goal, bit for bit, as are joints that stay."""
+    path = _holding(setup, path)
+    goals, states = setup.valid_goals, path.states
+    goal = goals[int(np.argmin(np.linalg.norm(goals - states[-1], axis=1)))]
+    if np.array_equal(states[0], setup.start) and np.array_equal(states[-1], goal):
+        return path
+    return Path(np.concatenate([setup.start[None], states[1:-1], goal[None]]))
+
+
+def _holding(setup: PlanningSetup, path: Path) -> Path:
+    """Return a path along which the joints that stay do so bit for bit; the search lets them off by its rounding."""
+    held, start = setup.held, setup.start
+    if not len(held):
+        return path
+    states, control = path.states.copy(), None if path.control is None else path.control.copy()
+    for array in (states, control):
+        if array is not None:
+            array[:, held] = start[held]
+    return Path(states, path.spline, control)
+
+
+def _searched(query: PlanQuery, execute: Execute) -> FoundPath:
+    """Return what the planner finds."""
+    setup, times = query.setup, query.times
+    with timed(times, "setup"), query.deadline.paused(), unforked():
+        planner = _set_up(query)
+    with motions_until(setup.motion_validator, query.ends_search):
+        status = execute(query, planner, min(query.deadline.for_search, MAX_TIME))
+    ours = reporting(planner)
+    report = query.report = None if ours is None else ours.report
+    if report is not None:
+        times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}
+        if report.solved_by:
+            times[FIRST] = report.first
+    if status is PlanStatus.APPROXIMATE_SOLUTION:
+        states = path_to_array(setup.simple_setup.getSolutionPath(), setup.robot.dof)
+        states[0] = setup.start
+        distance = float(np.linalg.norm(setup.goals - states[-1], axis=1).min())
+        reason = f"the nearest state found is {distance:.3g} rad from the goal"
+        return FoundPath(query, status, reason, Path(states), query.planner)
+    if status is not PlanStatus.EXACT_SOLUTION:
+        details = "" if status is PlanStatus.TIMEOUT else f" (OMPL says {status})"
+        details += f", {report.reason}" if report is not None and report.reason else ""
+        ends = status in (PlanStatus.INVALID_START, PlanStatus.INVALID_GOAL)  # which were checked before
+        reason = f"{query.planner} found no path in {query.deadline.timeout:g} s{details}"
+        return FoundPath(query, PlanStatus.TIMEOUT if ends else status, reason)
+    solution = setup.simple_setup.getSolutionPath()
+    path = None if report is None else report.path_of(solution)
+    path = Path(path_to_array(solution, setup.robot.dof)) if path is None else path
+    query.first_path = path if report is None or report.first_path is None else report.first_path
+    return FoundPath(query, status, "", path, query.planner if report is None else report.solved_by)
+
+
+def _set_up(query: PlanQuery) -> ob.Planner:
+    """Return the planner, warm."""
+    setup, parameters = query.setup, query.parameters
+    simple_setup = setup.simple_setup
+    si = simple_setup.getSpaceInformation()
+    simple_setup.getProblemDefinition().clearSolutionPaths()  # of other planners on the same setup
+    goals = setup.valid_goals
+    if parameters.threaded and len(goals) > 1:
+        nearest = goals[int(np.argmin(np.linalg.norm(goals - setup.start, axis=1)))]
+        set_goals(simple_setup, [nearest])
+        query.notes.append(f"{query.planner} runs threads and takes one goal: the nearest of {len(goals)}")
+    if parameters.optimizing:  # others would go on after their first solution, prm for one
+        simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
+    planner = parameters.build(si)
+    query.planner = parameters.name or planner.getName()
+    simple_setup.setPlanner(planner)
+    simple_setup.setup()
+    ours = reporting(planner)
+    if ours is not None:
+        ours.rejected_lines = query.rejected_lines
+    return planner
+
+
+def _out_of_time(query: PlanQuery) -> FoundPath:
+    return FoundPath(query, PlanStatus.TIMEOUT, f"no path in {query.deadline.timeout:g} s")
+
+
+def _verified(found: FoundPath, path: Path, simplify: bool) -> ProvedPath:
+    """Return the first of the shortened path and the path itself that passes the full check, or can be repaired."""
+    query, solved_by, setup, reason, late = found.query, found.solved_by, found.query.setup, "", False
+    candidates = [with_exact_ends(setup, path)]
+    if simplify and not query.parameters.smooth and path.spline is None and not query.ends_search():
+        with timed(query.times, "simplify"):
+            si = setup.simple_setup.getSpaceInformation()
+            candidates.insert(0, Path(shorten(si, candidates[0].states, query.ends_search)))
+        setup.raise_faults()
+    for candidate in candidates:
+        with timed(query.times, "verify"):
+            check = full_check(setup.checker, candidate.states, setup.start, setup.goals, deadline=query.deadline.at)
+        if check:
+            return ProvedPath(query, PlanStatus.EXACT_SOLUTION, "", candidate, solved_by, check.proof)
+        if check.timed_out:
+            return ProvedPath(query, PlanStatus.TIMEOUT, NOT_PROVED)
+        reason = reason or check.reason
+        with timed(query.times, "repair"):
+            end = clock.perf_counter() + REPAIR_SHARE * query.deadline.remaining
+            repaired = repair(setup, candidate.states, check, end, query.interrupt)
+        if repaired is not None:
+            return ProvedPath(query, PlanStatus.EXACT_SOLUTION, "", repaired[0], f"{solved_by}+repair", repaired[1])
+        late |= clock.perf_counter() >= end
+    failed = "and was not repaired in time" if late else "and repair"
+    return ProvedPath(query, PlanStatus.TIMEOUT, f"the path found failed the full check {failed}, {reason}")
+
+
+def _checked(found: FoundPath, path: Path) -> ProvedPath:
+    """Return an approximate solution with its certificate, or why it has none."""
+    query, setup, reason = found.query, found.query.setup, found.reason
+    check = full_check(setup.checker, path.states, setup.start, deadline=query.deadline.at)
+    if check.timed_out:
+        reason += ", and the path was not checked in time"
+    elif not check:
+        reason += f", and the path fails the full check, {check.reason}"
+    return ProvedPath(query, found.status, reason, path, found.solved_by, check.proof if check else None)
+
+
+def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> PlanResult:
+    """Return a result with the motion along its path, or why there is none."""
+    setup, limits, names = query.setup, query.setup.robot.limits, query.setup.robot.joint_names
+    proof, found = dict[str, float](), list[FullCheck]()
+
+    def fault(motion: Trajectory) -> str:
+        with timed(proof, "motion"):
+            shares = motion.use(timing.limits(limits, names))
+            over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
+            if over:
+                return f"the share of a limit that it uses is over 1: {', '.join(over)}"
+            check = full_check(setup.checker, motion, setup.start, setup.goals, deadline=query.deadline.at)
+            found.append(check)
+            return check.reason
+
+    try:
+        with timed(query.times, "timing"):
+            made = time_path(path, limits, names, timing, fault, stop=query.ends)
+    except TimingStoppedError:
+        return replace(result, status=PlanStatus.TIMEOUT, reason=NOT_TIMED)
+    except TimingError as error:
+        return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
+    finally:
+        query.times["timing"] -= proof.get("motion", 0.0)
+        query.times["timing proof"] = proof.get("motion", 0.0)
+    motion = made.trajectory
+    return replace(
+        result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation, timing_method=made.method,
+        motion_clearance=nan if found[-1].proof is None else found[-1].proof.clearance,
+    )  # fmt: skip
