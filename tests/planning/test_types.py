@@ -21,7 +21,7 @@ SOURCES = (
 )  # fmt: skip
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
 USE = """
-from apex_ompl import run
+from apex_ompl.api import run
 from apex_ompl.api import plan
 from apex_ompl.apex.planner import APEX
 from apex_ompl.scene.problem import PoseTarget, Problem
