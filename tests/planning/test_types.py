@@ -16,7 +16,7 @@ from apex_ompl.planning.planner import PlanKeywords, PlanOptions, ProblemKeyword
 from apex_ompl.planning.world import ObstacleFields
 
 SOURCES = (
-    "api.py", "loop/run.py", "planning/planner.py", "planning/world.py", "apex/planner.py", "apex/parameters.py",
+    "api.py", "planning/planner.py", "planning/world.py", "apex/planner.py", "apex/parameters.py",
     "ompl/parameters.py",
 )  # fmt: skip
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/record_type.py", "util/schema.py")
