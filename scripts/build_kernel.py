@@ -104,10 +104,10 @@ def code_sections(code: bytes) -> Iterator[bytes]:
     (table,) = struct.unpack_from("<Q", code, 40)
     size, count, names = struct.unpack_from("<HHH", code, 58)
     sections = [struct.unpack_from("<IIQQQQ", code, table + k * size) for k in range(count)]
-    for name, _, _, _, begin, length in sections:
+    for name, _, _, _, start, length in sections:
         label = code[sections[names][4] + name :].partition(b"\0")[0]
         if label.startswith((b".text", b".rodata.cst")):
-            yield code[begin : begin + length]
+            yield code[start : start + length]
 
 
 def main() -> None:
@@ -183,7 +183,7 @@ def compile_one(machine: Machine, name: str) -> Built:
     from apex_ompl.kernel.compiled.entry_points import ALL
     from apex_ompl.kernel.compiled.linking import ForeignCompiler
 
-    module, function = name.split(".")
+    module, _, function = name.rpartition(".")
     compiled = getattr(import_module(f"{library.PACKAGE}.{module}"), function)
     compiled.dispatcher._cache = NullCache()  # code from a cache has no module to emit
     compiled.dispatcher._compiler.pipeline_class = ForeignCompiler

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
     from apex_ompl.apex.sampler import ProposalSampler
     from apex_ompl.apex.trees import OmplTrees
-    from apex_ompl.kernel.search_buffers import SearchCounts
-    from apex_ompl.kernel.trees import TreePair
+    from apex_ompl.kernel.search import SearchCounts, TreePair
     from apex_ompl.model.query import Query
 
 MIN_GAIN = 1e-3  # least decrease of length that counts as an improvement [rad]

@@ -21,8 +21,7 @@ from apex_ompl.apex.sampler import ProposalSampler
 from apex_ompl.apex.stages import Anytime, Shorten, Solution, Stage, run_stage
 from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.shortcuts import shortcut
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair, shortcut
 from apex_ompl.ompl.own_planner import LOG, OwnPlanner, SolveReport, Status, Tree
 from apex_ompl.ompl.space import array_to_path
 from apex_ompl.paths.optimizer import Optimizer

@@ -1,6 +1,6 @@
 """Trees of RRT-Connect between starts and goals: in compiled code, and OMPL's own.
 
-Where this project's checker decides, trees grow in compiled code (:class:`apex_ompl.kernel.trees.TreePair`), several
+Where this project's checker decides, trees grow in compiled code (:class:`apex_ompl.kernel.search.TreePair`), several
 times as fast as OMPL's, which ask for each motion. They go only where the spheres prove that it is free; OMPL's
 RRTConnect, with the exact check, is the fallback, and what runs with another checker.
 """
@@ -14,7 +14,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair
 from apex_ompl.ompl.space import to_state
 from apex_ompl.types import Array
 from apex_ompl.util.resolution import SEARCH_RESOLUTION

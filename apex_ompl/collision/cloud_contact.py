@@ -11,12 +11,19 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.collision.clouds import PointCloud, cloud_of
 from apex_ompl.collision.containment import EnclosingMesh
-from apex_ompl.collision.exact_shapes import Mesh, PlacedShape, ball_tree, mesh_of, tree_order
+from apex_ompl.collision.exact_shapes import PlacedShape, mesh_of
 from apex_ompl.collision.hulls import hull_planes
 from apex_ompl.collision.shapes import coal_geometry, is_shell, is_surface
 from apex_ompl.collision.solids import Solid, world_boxes
-from apex_ompl.kernel.compiled.cloud_distance import any_inside, near_mesh, near_primitive, primitive_distances
-from apex_ompl.kernel.compiled.triangle_distance import surface_distances
+from apex_ompl.kernel.geometry import (
+    BallTree,
+    any_inside,
+    near_mesh,
+    near_primitive,
+    primitive_distances,
+    surface_distances,
+    tree_order,
+)
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.meshes import triangles
@@ -25,7 +32,6 @@ from apex_ompl.util.validation import check_array, check_number, finite_array
 from apex_ompl.util.weak_cache import weakly_cached
 
 SOME = 10_000  # points
-STACK = 128  # nodes that wait in a walk down a tree
 LARGEST_MARGIN = 1.0  # [m]
 NEARLY = 1e-6  # beyond a limit [m]
 
@@ -38,19 +44,12 @@ def touches(cloud_shape: coal.CollisionGeometry, shape: coal.CollisionGeometry, 
         shape: The solid.
         pose: Its pose in the cloud's frame [m].
     """
-    tree, at, stack = mesh_of(cloud_shape), np.ascontiguousarray(pose.homogeneous), np.empty((STACK, 2), np.int64)
-    points = tree.corners, tree.balls, tree.child, tree.leaf
-    boxed = tree.corners, tree.balls, tree.halves, tree.child, tree.leaf
+    cloud, at = mesh_of(cloud_shape), np.ascontiguousarray(pose.homogeneous)
     if not is_shell(shape):
-        return bool(near_primitive(*points, *_primitive(shape), at, tree.radius, stack))
-    own = _surface(shape)
-    surface = own.corners, own.balls, own.halves, own.child, own.leaf
-    if near_mesh(*boxed, *surface, at, tree.radius, stack):
+        return near_primitive(cloud.tree, *_primitive(shape), at, cloud.radius)
+    if near_mesh(cloud.tree, _surface(shape), at, cloud.radius):
         return True
-    if is_surface(shape):
-        return False
-    outer = EnclosingMesh.of(shape)
-    return bool(any_inside(*points, outer.corners, outer.box, outer.watertight, *_planes(shape), at, stack))
+    return not is_surface(shape) and any_inside(cloud.tree, EnclosingMesh.of(shape).surface, _planes(shape), at)
 
 
 def nearest_balls(solid: Solid, boxes: Array) -> list[Solid]:
@@ -130,19 +129,14 @@ def signed_distances(shape: coal.CollisionGeometry, points: Array, limit: float)
         points: Shape (N, 3) [m].
         limit: Largest distance of interest [m].
     """
-    points, distances = np.ascontiguousarray(points), np.empty(len(points))
+    points = np.ascontiguousarray(points)
     if not is_shell(shape):
-        primitive_distances(points, *_primitive(shape), distances)
-        return np.minimum(limit, distances)
+        return np.minimum(limit, primitive_distances(points, *_primitive(shape)))
     tree = _surface(shape)
-    arrays = np.ascontiguousarray(tree.corners), tree.balls, tree.child, tree.leaf, np.empty(STACK, np.int64)
-    surface_distances(points, *arrays, limit, distances)
-    if is_surface(shape):
-        return distances
-    inside = _within(shape, points)
-    deep = np.empty(len(inside))
-    surface_distances(np.ascontiguousarray(points[inside]), *arrays, np.inf, deep)
-    distances[inside] = -deep
+    distances = surface_distances(points, tree, limit)
+    if not is_surface(shape):
+        inside = _within(shape, points)
+        distances[inside] = -surface_distances(np.ascontiguousarray(points[inside]), tree, np.inf)
     return distances
 
 
@@ -155,15 +149,14 @@ def _within(shape: coal.BVHModelBase, points: Array) -> Indices:
 
 
 @weakly_cached
-def _surface(shape: coal.BVHModelBase) -> Mesh:
+def _surface(shape: coal.BVHModelBase) -> BallTree:
     """Return the triangles of a mesh under a tree, also of one that is convex."""
-    mesh = mesh_of(shape)
-    if len(mesh.leaf):
-        return mesh
+    tree = mesh_of(shape).tree
+    if len(tree.leaf):
+        return tree
     vertices, faces = triangles(shape)
     corners = vertices[faces]
-    corners = corners[tree_order(corners.mean(axis=1))]
-    return Mesh(mesh.points, corners, *ball_tree(corners))
+    return BallTree.over(corners[tree_order(corners.mean(axis=1))])
 
 
 def _primitive(shape: coal.CollisionGeometry) -> tuple[int, Array]:

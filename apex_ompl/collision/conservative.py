@@ -15,11 +15,8 @@ from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.stored_tables import make_tables, stored_tables
 from apex_ompl.collision.tabulate import primitives
-from apex_ompl.kernel.ahead_of_time import compile_ahead
-from apex_ompl.kernel.compiled import motion_proof, queries
-from apex_ompl.kernel.compiled.entry_points import PLANS
-from apex_ompl.kernel.compiled.separation import COLLIDES
-from apex_ompl.kernel.kernel import MOST_PAIRS, Kernel
+from apex_ompl.kernel.ahead_of_time import compile_for_plans
+from apex_ompl.kernel.kernel import COLLIDES, MOST_PAIRS, Kernel, PathCheck
 from apex_ompl.kernel.scene_builder import Solids, moved, tables_of
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot
@@ -111,7 +108,7 @@ class ConservativeChecker:
         """
         if self._kernel is not None and self._listed and self._held_listed and not self._moved:
             return self._kernel
-        compile_ahead(PLANS)
+        compile_for_plans()
         with self._lock:
             old = self._kernel
             robot = self._robot_tables() if old is None or not self._held_listed else old.robot
@@ -184,16 +181,12 @@ class ConservativeChecker:
 
     def unproved_at(self, q: Array, check_counts: CheckCounts) -> UnprovedPairs | None:
         """Return the pairs left to the meshes at a state, shape (dof,); None where it is proved free."""
-        buffers = self._buffers()
-        buffers.state[0] = q
-        queries.check_states(
-            *self.kernel.packed, *buffers.workspace, buffers.state, buffers.found[None], buffers.ends[:1]
-        )
-        count = int(buffers.ends[0])
+        check = self._check()
+        count = check.check_state(self.kernel, q)
         if count == 0:
             check_counts.proved += 1
             return None
-        return self._left(buffers.found, count)
+        return self._left(check.pairs, count)
 
     def unproved_among(
         self, states: Array, check_counts: CheckCounts, threads: int = 1
@@ -232,57 +225,33 @@ class ConservativeChecker:
         Raises:
             NoGridError: The path has numbers that are not finite, or is too long for its resolution.
         """
-        buffers = self._buffers()
-        starts = buffers.starts if len(path) == 2 else np.empty(len(path), np.int64)
-        last = motion_proof.lay_grid(path, resolution, starts)
-        if last < 0:
+        check = self._check()
+        steps = check.start(path, resolution, (0, -1) if start else (-1,))
+        if steps < 0:
             raise NoGridError
-        queue, ends, state = buffers.queue, buffers.ends, buffers.state[0]
-        if len(queue) < 2 * last + 4:
-            queue = np.empty((2 * last + 4, 2), np.int64)
-        entered = [(0, 0), (last, last), (0, last)][0 if start else 1 :]
-        queue[: len(entered)] = entered
-        ends[:2] = 0, len(entered)
-        buffers.counts[:] = 0
         hit = None
         while hit is None:
-            number = motion_proof.prove_path(
-                *self.kernel.packed, *buffers.workspace, path, starts, queue, ends, state, buffers.found, buffers.counts
-            )
-            if number == motion_proof.DONE:
+            number = check.first_unproved(self.kernel)
+            if number is None:
                 break
-            if not is_free(state, self._left(buffers.found, int(ends[2]))):
-                hit = state.copy(), max(int(np.searchsorted(starts, number)) - 1, 0)
-        proved, _, proved_intervals, intervals, proved_steps = buffers.counts.tolist()
-        check_counts.proved += proved
-        check_counts.intervals += intervals
-        check_counts.proved_intervals += proved_intervals
-        check_counts.proved_steps += proved_steps
-        check_counts.steps += last
+            if not is_free(check.state, self._left(check.pairs, check.open_pairs)):
+                hit = check.state.copy(), check.segment(number)
+        counts = check.counts
+        check_counts.proved += counts.proved
+        check_counts.intervals += counts.intervals
+        check_counts.proved_intervals += counts.proved_intervals
+        check_counts.proved_steps += counts.proved_steps
+        check_counts.steps += steps
         return hit
 
-    def _buffers(self) -> _Buffers:
-        """Return this thread's buffers for the kernel as it is now."""
-        buffers: _Buffers | None = getattr(self._local, "buffers", None)
+    def _check(self) -> PathCheck:
+        """Return this thread's memory for checks by the kernel as it is now."""
+        check: PathCheck | None = getattr(self._local, "check", None)
         kernel = self.kernel
-        if buffers is None or buffers.robot is not kernel.robot:
-            buffers = self._local.buffers = _Buffers(kernel)
-        return buffers
+        if check is None or check.robot is not kernel.robot:
+            check = self._local.check = PathCheck(kernel)
+        return check
 
 
 class NoGridError(Exception):
     """A path that no grid can be laid over."""
-
-
-class _Buffers:
-    """Arrays that one thread passes to compiled code."""
-
-    def __init__(self, kernel: Kernel) -> None:
-        self.robot = kernel.robot
-        self.workspace = kernel.workspace()
-        self.state = np.empty((1, kernel.robot.dof))
-        self.found = np.empty((MOST_PAIRS, 2), np.int64)
-        self.starts = np.empty(2, np.int64)
-        self.queue = np.empty((4096, 2), np.int64)
-        self.ends = np.zeros(3, np.int64)
-        self.counts = np.zeros(5, np.int64)

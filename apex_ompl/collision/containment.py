@@ -15,7 +15,7 @@ import numpy as np
 
 from apex_ompl.collision.hulls import convex_hull, hull_corners, hull_planes
 from apex_ompl.collision.shapes import is_shell
-from apex_ompl.kernel.compiled.triangle_mesh import encloses
+from apex_ompl.kernel.geometry import EnclosingSurface
 from apex_ompl.scene.meshes import capped, edges_of, is_watertight, piece_points, triangles
 from apex_ompl.types import Array
 from apex_ompl.util.boxes import bounding_box
@@ -71,8 +71,12 @@ class EnclosingMesh:
 
     def contains(self, point: Array) -> bool:
         """Whether a point in the mesh's frame, not on its surface, lies in the solid."""
-        x, y, z = point.tolist()
-        return bool(encloses(self.corners, self.box, self.watertight, x, y, z))
+        return self.surface.encloses(point)
+
+    @property
+    def surface(self) -> EnclosingSurface:
+        """Its triangles for the kernel."""
+        return EnclosingSurface(self.corners, self.box, self.watertight)
 
 
 def _is_convex(centers: Array, hull: coal.Convex) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled.motion_proof import MOST_STEPS
+from apex_ompl.kernel.kernel import MOST_STEPS
 from apex_ompl.paths.path import states_between
 from apex_ompl.types import Array
 

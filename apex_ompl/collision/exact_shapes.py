@@ -15,10 +15,19 @@ from apex_ompl.collision.clouds import cloud_of
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.hulls import below_support, convex_hull, hull_planes
 from apex_ompl.collision.shapes import is_shell
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
-from apex_ompl.kernel.compiled.ball_tree import median_order, node_balls
-from apex_ompl.kernel.compiled.layout import Integers
-from apex_ompl.kernel.compiled.shapes import HULL, POINT, TRIANGLE, ShapeArrays
+from apex_ompl.kernel.arrays import (
+    BOX,
+    CAPSULE,
+    CYLINDER,
+    HALF_SPACE,
+    HULL,
+    POINT,
+    SPHERE,
+    TRIANGLE,
+    Integers,
+    ShapeArrays,
+)
+from apex_ompl.kernel.geometry import BallTree, tree_order
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import length
@@ -40,11 +49,7 @@ class Mesh(NamedTuple):
 
     Attributes:
         points: Corners of its convex hull, or of the box around a cloud, shape (P, 3) [m].
-        corners: Corners of its triangles in the tree's order, shape (T, 3, 3) [m]; none for a mesh that is its hull.
-        balls: Center and radius around the triangles below each node of the tree, shape (2 T - 1, 4) [m].
-        halves: Half edges of their bounding box, which has the same center, shape (2 T - 1, 3) [m].
-        child: First child of each node, -1 for leaves, shape (2 T - 1,).
-        leaf: Triangle of each leaf, -1 for inner nodes, shape (2 T - 1,).
+        tree: Tree over its triangles, or over the points of a cloud; empty for a mesh that is its hull.
         depth: Depth of triangles' centers below the hull, 0 for a mesh that is its hull [m].
         edge_first: For each point of a large hull the first of its edges, and the end of the last; shape (P + 1,), else
             (0,).
@@ -53,11 +58,7 @@ class Mesh(NamedTuple):
     """
 
     points: Array
-    corners: Array
-    balls: Array
-    halves: Array
-    child: NDArray[np.int64]
-    leaf: NDArray[np.int64]
+    tree: BallTree
     depth: float = 0.0
     edge_first: NDArray[np.int64] = np.empty(0, np.int64)
     edge_end: NDArray[np.int64] = np.empty(0, np.int64)
@@ -127,19 +128,17 @@ def _analyzed(geometry: coal.CollisionGeometry) -> Mesh:
     cloud = cloud_of(geometry)
     if cloud is not None:
         points = np.ascontiguousarray(cloud.points[tree_order(cloud.points)])[:, None]
-        return Mesh(np.array(geometry.points()), points, *ball_tree(points), np.inf, radius=cloud.radius)
+        return Mesh(np.array(geometry.points()), BallTree.over(points), np.inf, radius=cloud.radius)
     hull = convex_hull(geometry)
-    mesh = Mesh(
-        np.array(hull.points()), np.empty((0, 3, 3)), np.empty((0, 4)), np.empty((0, 3)), *(np.empty(0, np.int64),) * 2,
-        0.0, *_edges(hull),
-    )  # fmt: skip
+    none = BallTree(np.empty((0, 3, 3)), np.empty((0, 4)), np.empty((0, 3)), *(np.empty(0, np.int64),) * 2)
+    mesh = Mesh(np.array(hull.points()), none, 0.0, *_edges(hull))
     if is_shell(geometry):
         vertices, faces = triangles(geometry)
         corners = vertices[faces]
         depth = _depth(hull, corners)
         if depth > CONVEX_TOLERANCE:
             corners = corners[tree_order(corners.mean(axis=1))]
-            mesh = Mesh(mesh.points, corners, *ball_tree(corners), depth, *_edges(hull))
+            mesh = Mesh(mesh.points, BallTree.over(corners), depth, *_edges(hull))
     return mesh
 
 
@@ -186,40 +185,6 @@ def _on_hull(hull: coal.CollisionGeometry, corners: Array) -> Flags:
     return np.asarray((long > 0.0) & (depths <= CONVEX_TOLERANCE))
 
 
-def tree_order(centers: Array) -> NDArray[np.int64]:
-    """Return points in the order of a tree whose nodes are halved across their longest sides."""
-    order = np.arange(len(centers))
-    median_order(np.ascontiguousarray(centers), order, np.empty((128, 2), np.int64))
-    return order
-
-
-def ball_tree(corners: Array) -> tuple[Array, Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Return a binary tree over triangles or points in their order, shape (T, k, 3) [m], see :class:`Mesh`.
-
-    Each node holds a range of triangles, its children the two halves; nodes stand level by level.
-
-    Returns:
-        Balls, half edges of boxes, children and leaves.
-    """
-    first, last = np.zeros(1, np.int64), np.array([len(corners)])
-    firsts, lasts, child, leaf, count = [], [], [], [], 1
-    while len(first):
-        firsts.append(first)
-        lasts.append(last)
-        inner = last - first > 1
-        number = np.full(len(first), -1, np.int64)
-        number[inner] = count + 2 * np.arange(int(inner.sum()))
-        child.append(number)
-        leaf.append(np.where(inner, -1, first))
-        count += 2 * int(inner.sum())
-        middle = (first + last)[inner] // 2
-        first = np.stack([first[inner], middle], axis=1).ravel()
-        last = np.stack([middle, last[inner]], axis=1).ravel()
-    balls, halves = np.empty((count, 4)), np.empty((count, 3))
-    node_balls(np.ascontiguousarray(corners), np.concatenate(firsts), np.concatenate(lasts), balls, halves)
-    return balls, halves, np.concatenate(child), np.concatenate(leaf)
-
-
 def shape_arrays(placed: Sequence[PlacedShape]) -> ShapeArrays:
     """Return the kernel's arrays of shapes."""
     points, point_count = [np.empty((0, 3))], 0
@@ -240,16 +205,17 @@ def shape_arrays(placed: Sequence[PlacedShape]) -> ShapeArrays:
         place, edge_count = place + len(mesh.edge_first), edge_count + len(mesh.edge_end)
         spans.append((point_count, len(mesh.points)))
         point_count += len(mesh.points)
-        roots.append(node_count if len(mesh.leaf) else -1)
-        child.append(np.where(mesh.child >= 0, mesh.child + node_count, -1))
-        each = mesh.corners.shape[1]
-        first = point_count + each * mesh.leaf
-        corner.append(np.where(mesh.leaf < 0, -1, first if each == TRIANGLE else POINT - first))
-        nodes.append(mesh.balls)
-        halves.append(mesh.halves)
-        points += [mesh.points, mesh.corners.reshape(-1, 3)]
-        point_count += each * len(mesh.corners)
-        node_count += len(mesh.leaf)
+        tree = mesh.tree
+        roots.append(node_count if len(tree.leaf) else -1)
+        child.append(np.where(tree.child >= 0, tree.child + node_count, -1))
+        each = tree.corners.shape[1]
+        first = point_count + each * tree.leaf
+        corner.append(np.where(tree.leaf < 0, -1, first if each == TRIANGLE else POINT - first))
+        nodes.append(tree.balls)
+        halves.append(tree.halves)
+        points += [mesh.points, tree.corners.reshape(-1, 3)]
+        point_count += each * len(tree.corners)
+        node_count += len(tree.leaf)
     poses = [shape.row for shape in placed]
     return ShapeArrays(
         kind=np.array([s.kind for s in placed], np.int64),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.shapes import is_shell, is_surface
-from apex_ompl.kernel.compiled.farthest_points import farthest_points
+from apex_ompl.kernel.geometry import farthest_points
 from apex_ompl.scene.meshes import FLAT
 from apex_ompl.types import Array
 from apex_ompl.util.boxes import bounding_box
@@ -130,7 +130,5 @@ def farthest(directions: Array, points: Array) -> tuple[NDArray[np.intp], Array]
     first = np.flatnonzero(np.diff(cells[order], prepend=-1))
     points = np.ascontiguousarray(points[order])
     middles = low + side * (np.floor((points[first] - low) / side) + 0.5)
-    found = np.empty(len(directions), np.int64)
-    half, directions = (0.5 + 1e-6) * side, np.ascontiguousarray(directions)
-    farthest_points(directions, points, np.append(first, len(order)), middles, half, found)
+    found = farthest_points(directions, points, np.append(first, len(order)), middles, (0.5 + 1e-6) * side)
     return order[found], np.einsum("ij,ij->i", directions, points[found])

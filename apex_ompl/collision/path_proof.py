@@ -16,14 +16,13 @@ from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
 from apex_ompl.collision.stored_tables import stored_shapes
 from apex_ompl.collision.tabulate import joint_tree
-from apex_ompl.kernel.compiled import curve_proof
-from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
-from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
-from apex_ompl.kernel.compiled.shapes import PairBuffers, ShapeArrays
+from apex_ompl.kernel.arrays import Floats, Integers, ShapeArrays, pack
+from apex_ompl.kernel.curve_proof import MORE, OUTSIDE, PROVED, TOUCHING, CurveProof
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.products import product
 from apex_ompl.kernel.scene_builder import primitive, scene_tables
 from apex_ompl.kernel.tables import with_pairs
+from apex_ompl.kernel.timing import cubic_rates
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact, distinct
@@ -54,7 +53,7 @@ class Curve:
         knots: Increasing parameters of the states, shape (K,): lengths [rad], or times [s].
         states: Shape (K, dof).
         rates: Velocities and accelerations side by side, shape (K, 2 dof); (0, 2 dof) for straight lines.
-        slack: What the pieces miss each other by, by rounding, in all [rad].
+        slack: Sum of the gaps between the pieces, by rounding [rad].
     """
 
     knots: Array
@@ -82,8 +81,7 @@ class Curve:
         if len(times) == 1:
             return cls.polyline(positions)
         t, q, v, a = map(compact, (times, positions, velocities, accelerations))
-        rates = np.empty((len(t), 2 * q.shape[1]))
-        return cls(t, q, rates, cubic_rates(t, q, v, a, rates))
+        return cls(t, q, *cubic_rates((t, q, v, a)))
 
 
 @dataclass(frozen=True)
@@ -212,35 +210,29 @@ class PathProver:
         """
         if not (np.isfinite(curve.states).all() and np.isfinite(curve.rates).all()):
             return PathProof.refused("a state that is not finite", curve)
-        buffers, knots = self._buffers(kernel), curve.knots
-        p, arrays = buffers.proof, (*kernel.packed, *self._shapes(kernel), *buffers.arrays)
+        proof, shapes = self._proof(kernel), self._shapes(kernel)
         for limit in self._limits(kernel, curve) if tolerance > 0.0 else (0.0,):
-            p.places[:] = 0, 1, 0
-            p.pairs[0], p.intervals[0] = curve_proof.ALL, (knots[0], knots[-1])
-            p.worst[:] = -1
-            p.figures[:] = limit, np.inf, knots[0], 0.0
-            outcome, over = curve_proof.MORE, False
-            while outcome == curve_proof.MORE and not over:
-                outcome = curve_proof.prove_curve(
-                    *arrays, knots, curve.states, curve.rates, curve.slack, touch, tolerance, BUDGET
-                )
-                over = outcome == curve_proof.MORE and deadline is not None and time.perf_counter() > deadline
-            if over or outcome != curve_proof.PROVED or p.figures[curve_proof.LEAST] <= limit:
+            proof.start(kernel, shapes, curve, limit)
+            outcome, over = MORE, False
+            while outcome == MORE and not over:
+                outcome = proof.advance(touch, tolerance, BUDGET)
+                over = outcome == MORE and deadline is not None and time.perf_counter() > deadline
+            if over or outcome != PROVED or proof.figures.least <= limit:
                 break
-        margin, least, where, by_spheres = p.figures.tolist()
-        names, ok = self._names(kernel, int(p.worst[0]), int(p.worst[1])), outcome == curve_proof.PROVED
-        reason, length = "", float(knots[-1] - knots[0])
+        margin, least, where, by_spheres = proof.figures
+        names, ok = self._names(kernel, *proof.pair), outcome == PROVED
+        reason, length = "", float(curve.knots[-1] - curve.knots[0])
         if over:
             reason = "not proved in time"
-        elif outcome == curve_proof.TOUCHING:
+        elif outcome == TOUCHING:
             reason = f"{names[0]} <-> {names[1]} " + ("touch" if least <= 0.0 else f"are {least * 1e6:.2g} um apart")
-        elif outcome == curve_proof.OUTSIDE:
-            reason, where, least = "a hand outside its limits", float(p.where[0]), np.nan
+        elif outcome == OUTSIDE:
+            reason, where, least = "a hand outside its limits", proof.middle, np.nan
         elif not ok:
-            reason, where = "too close to contact to be proved", float(p.where[0])
+            reason, where = "too close to contact to be proved", proof.middle
         share = by_spheres / length if length > 0.0 else 0.0
         bound = margin if ok and tolerance > 0.0 else 0.0
-        return PathProof(ok, reason, where, p.state.copy(), least, bound, names, share, int(p.places[2]), over)
+        return PathProof(ok, reason, where, proof.state, least, bound, names, share, proof.intervals, over)
 
     @staticmethod
     def _limits(kernel: Kernel, curve: Curve) -> Iterator[float]:
@@ -259,19 +251,9 @@ class PathProver:
         numbers, solids = kernel.robot.numbers, self._scene.solids
         return solids[numbers[first]].name, solids[numbers[second] if second >= 0 else -1 - second].name
 
-    def _buffers(self, kernel: Kernel) -> _Buffers:
-        """Return this thread's buffers for a kernel."""
-        buffers: _Buffers | None = getattr(self._local, "buffers", None)
-        if buffers is None or buffers.robot is not kernel.robot:
-            buffers = self._local.buffers = _Buffers(kernel)
-        return buffers
-
-
-class _Buffers:
-    """Arrays that one thread passes to compiled code."""
-
-    def __init__(self, kernel: Kernel) -> None:
-        self.robot = kernel.robot
-        self.proof: curve_proof.ProofBuffers
-        integers, floats, self.proof = new_buffers(curve_proof.ProofBuffers, dof=kernel.robot.dof)
-        self.arrays = (*kernel.workspace(), *new_buffers(PairBuffers)[:2], integers, floats)
+    def _proof(self, kernel: Kernel) -> CurveProof:
+        """Return this thread's memory for proofs by a kernel."""
+        proof: CurveProof | None = getattr(self._local, "proof", None)
+        if proof is None or proof.robot is not kernel.robot:
+            proof = self._local.proof = CurveProof(kernel)
+        return proof

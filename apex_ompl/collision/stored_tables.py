@@ -26,9 +26,7 @@ from apex_ompl.collision.robot_covers import covers_of
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.collision.solids import Solid
 from apex_ompl.collision.tabulate import tabulate
-from apex_ompl.kernel.compiled.arrays import RobotArrays
-from apex_ompl.kernel.compiled.layout import pack, unpack
-from apex_ompl.kernel.compiled.shapes import ShapeArrays
+from apex_ompl.kernel.arrays import RobotArrays, ShapeArrays, pack, unpack
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot
 from apex_ompl.scene.meshes import triangles

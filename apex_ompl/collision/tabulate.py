@@ -16,7 +16,7 @@ from apex_ompl.collision.inner_balls import inner_balls
 from apex_ompl.collision.shapes import is_surface
 from apex_ompl.collision.solids import Solid
 from apex_ompl.errors import RobotError
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
+from apex_ompl.kernel.arrays import BOX, CAPSULE, CYLINDER, GRID, HALF_SPACE, PRISMATIC, REVOLUTE, SPHERE
 from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_builder import robot_tables

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays
 from apex_ompl.kernel.compiled.layout import pack, unpack
-from apex_ompl.kernel.compiled.state_costs import state_costs
+from apex_ompl.kernel.compiled.moving.dynamic_obstacles import DynamicArrays
+from apex_ompl.kernel.compiled.moving.state_costs import state_costs
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
@@ -23,15 +23,15 @@ NO_DYNAMIC_OBSTACLES: tuple[Any, ...] = pack(
         stamp=_NOTHING, growth=_NOTHING, values=np.empty(0, np.float32),
     )
 )  # fmt: skip
-"""No obstacles that move, packed."""
+"""No dynamic obstacles, packed."""
 
 
 class ClearanceCosts(NamedTuple):
-    """Clearance costs of N states; see :mod:`apex_ompl.kernel.compiled.clearance_cost` for the formula.
+    """Clearance costs of N states; see :mod:`apex_ompl.kernel.compiled.check.clearance_cost` for the formula.
 
     Attributes:
         cost: Half the sum of the squared violations of the margins, each as a share of its margin, shape (N,); infinite
-            where the tables of the robot do not hold for a state, of which the rest is 0.
+            where the tables of the robot do not hold for a state, whose other results are 0.
         gradient: Its gradient, shape (N, dof) [1/rad].
         gram: Its Gauss-Newton matrix, shape (N, dof, dof) [1/rad^2].
         clearance: Clearances of the sphere cover to obstacles, and of the robot to itself, at most the margins; shape
@@ -48,7 +48,7 @@ def clearance_costs(
     kernel: Kernel, states: ArrayLike, scene_margin: float, own_margin: float, times: ArrayLike | None = None,
     dynamic: tuple[Any, ...] = NO_DYNAMIC_OBSTACLES,
 ) -> ClearanceCosts:  # fmt: skip
-    """Return what states cost that are nearer than margins to obstacles, or of which links are to each other.
+    """Return the clearance costs of states, where obstacles or links are nearer than margins.
 
     The residuals are those of pairs: a cluster of spheres and an obstacle, or two clusters, by their nearest spheres.
 
@@ -57,8 +57,8 @@ def clearance_costs(
         states: States, shape (N, dof).
         scene_margin: Clearance to obstacles below which a state costs [m].
         own_margin: Clearance between links below which it costs [m].
-        times: Times at which dynamic obstacles are looked at, shape (N,) [s]; by default 0.
-        dynamic: Obstacles that move, packed as :class:`apex_ompl.kernel.compiled.dynamic_obstacles.DynamicArrays`.
+        times: Times at which dynamic obstacles are examined, shape (N,) [s]; by default 0.
+        dynamic: Dynamic obstacles, packed as :class:`apex_ompl.kernel.arrays.DynamicArrays`.
 
     Raises:
         ParameterError: Another shape, a margin that is not positive, or a time that is not finite.

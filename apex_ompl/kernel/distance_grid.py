@@ -1,7 +1,7 @@
-"""Grids of distances to surfaces and points: lower bounds of the signed distance, whatever the number of triangles.
+"""Grids of distances to surfaces and points: lower bounds of the signed distance for any number of triangles.
 
 At the nodes near a surface the distance is exact, elsewhere it is that of a distance transform less its largest error.
-Between nodes it is interpolated linearly along each axis. A distance changes by at most the way, so that interpolation
+Between nodes it is interpolated linearly along each axis. A distance function is 1-Lipschitz, so that interpolation
 is wrong by at most sum_i w_i |x - x_i| <= sqrt(3) / 2 spacings, by which the values at the nodes are lowered.
 """
 
@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.grid_distance import SLACK
-from apex_ompl.kernel.compiled.grid_tabulation import tabulate_points, tabulate_triangles
-from apex_ompl.kernel.compiled.item_tree import BUCKET, HALF, fill_boxes, order_items
+from apex_ompl.kernel.compiled.geometry.bounding_trees import BUCKET, HALF, fill_boxes, order_items
+from apex_ompl.kernel.compiled.geometry.grid_building import tabulate_points, tabulate_triangles
+from apex_ompl.kernel.compiled.geometry.grid_distance import SLACK
 from apex_ompl.kernel.compiled.layout import Integers, Singles
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
@@ -32,14 +32,14 @@ MOST_NODES = 6_000_000
 MOST_NODES_OF_POINTS = 1_000_000  # which are made anew with every image
 FINEST = 0.003  # spacing [m]
 PADDING = 2.5  # nodes around the box of what is tabulated
-BAND = 1.5  # distance up to which nodes are looked at for each triangle, in spacings
+BAND = 1.5  # distance up to which nodes are examined for each triangle, in spacings
 SEED = SLACK**2 + 1e-3  # the node nearest to the closest point of a surface is within the slack of it, squared
 ROUNDING = 1e-6  # [m]
 KEPT_NODES = 40_000_000  # of grids that are kept by content
 
 
 class ItemTree(NamedTuple):
-    """Sizes of a tree of boxes over points or triangles, see :mod:`apex_ompl.kernel.compiled.item_tree`.
+    """Sizes of a tree of boxes over points or triangles, see :mod:`apex_ompl.kernel.compiled.geometry.bounding_trees`.
 
     Attributes:
         levels: Levels below the root.
@@ -123,7 +123,7 @@ def grid_of_triangles(corners: Array, solid: bool, at_work: Callable[[], None] =
 def grid_of_triangles_beside(corners: Array, solid: bool) -> Iterator[None]:
     """Make the grid of a surface in a thread of its own during a block that holds the interpreter's lock.
 
-    The thread needs that lock no more when the block begins. Afterwards :func:`grid_of_triangles` has the grid.
+    The thread no longer needs that lock when the block starts. Afterwards :func:`grid_of_triangles` has the grid.
     """
     at_work = threading.Event()
 

@@ -80,7 +80,7 @@ def _compile(group: Group, shares: list[list[str]]) -> None:
 
 @contextmanager
 def _beside(names: list[str], bar: Any, seconds: Mapping[str, int]) -> Iterator[None]:
-    """Let a process compile functions during a block, and wait for it behind; it ends with the block's exception."""
+    """Let a process compile functions during a block, then wait for it; it ends with the block's exception."""
     command = [*this_python(), "-c", CHILD, *names]
     environment = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with subprocess.Popen(
@@ -101,7 +101,7 @@ def _beside(names: list[str], bar: Any, seconds: Mapping[str, int]) -> Iterator[
 
 
 def _function(name: str) -> CompiledFunction:
-    module, function = name.split(".")
+    module, _, function = name.rpartition(".")
     found: CompiledFunction = getattr(import_module(f"apex_ompl.kernel.compiled.{module}"), function)
     return found
 
@@ -109,4 +109,4 @@ def _function(name: str) -> CompiledFunction:
 def _missing(names: Iterable[str]) -> list[str]:
     """Return those of some functions that are not in the cache."""
     there = names_in_cache()
-    return [name for name in names if name.split(".")[1] not in there]
+    return [name for name in names if name.rpartition(".")[2] not in there]

@@ -10,9 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled.ik_solver import descend, ik_buffer_sizes, residual_and_jacobian
-from apex_ompl.kernel.compiled.ik_targets import ANGLE, OFFSET, OPPOSITION, TargetArrays
 from apex_ompl.kernel.compiled.layout import Floats, Integers, pack
+from apex_ompl.kernel.compiled.robot.inverse_kinematics import (
+    ANGLE,
+    OFFSET,
+    OPPOSITION,
+    TargetArrays,
+    descend,
+    ik_buffer_sizes,
+    residual_and_jacobian,
+)
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array

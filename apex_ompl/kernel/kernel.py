@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled import joint_push, motion_proof, queries
+from apex_ompl.kernel.compiled.check import motion_proof, queries, separation
+from apex_ompl.kernel.compiled.robot.kinematics import joint_pushes
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.kernel.threads import in_threads
@@ -18,6 +20,8 @@ from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import number_array, shape_error
 
 MOST_PAIRS = 16  # pairs that are listed for one state
+MOST_STEPS = motion_proof.MOST_STEPS  # of a grid of states over a path
+COLLIDES = separation.COLLIDES  # stands for the number of pairs of a state that is proved to collide
 
 
 class Kernel:
@@ -146,7 +150,7 @@ class Kernel:
             reach: A force falls from 1 at an obstacle to 0 at this distance [m].
         """
         pushed, arrays = np.empty((len(points), self.robot.dof)), map(np.ascontiguousarray, (points, *found))
-        joint_push.joint_pushes(*self.robot.packed, *frames, carriers, *arrays, float(reach), pushed)
+        joint_pushes(*self.robot.packed, *frames, carriers, *arrays, float(reach), pushed)
         return pushed
 
     def proves(self, path: ArrayLike, resolution: float) -> bool:
@@ -164,15 +168,93 @@ class Kernel:
             raise shape_error(states, ("N", self.robot.dof), "path", least=2)
         if not resolution > 0.0:
             raise ParameterError("resolution", resolution, "a positive number of radians")
-        found, counts = self.unproved(states[[0, -1]])
-        if counts.any():
+        if self.unproved(states[[0, -1]])[1].any():
             return False
-        starts = np.empty(len(states), np.int64)
-        last = motion_proof.lay_grid(states, float(resolution), starts)
+        check = PathCheck(self)
+        last = check.start(states, float(resolution), [])
+        return last >= 0 and check.first_unproved(self) is None
+
+
+class PathCounts(NamedTuple):
+    """Counts of the check of a path.
+
+    Attributes:
+        proved: States that were proved free.
+        open: States that were not.
+        proved_intervals: Intervals that were proved as a whole.
+        intervals: Intervals that were tried.
+        proved_steps: Steps of the grid inside proved intervals.
+    """
+
+    proved: int
+    open: int
+    proved_intervals: int
+    intervals: int
+    proved_steps: int
+
+
+class PathCheck:
+    """Checks of states and paths by the spheres, in one thread's memory.
+
+    Attributes:
+        robot: The robot that it was made for.
+        state: The state that was examined last, shape (dof,).
+        pairs: Pairs that are not proved there, shape (MOST_PAIRS, 2): two bodies, or a body and -1 - obstacle.
+    """
+
+    def __init__(self, kernel: Kernel) -> None:
+        """Allocate buffers for checks of a kernel's robot."""
+        self.robot = kernel.robot
+        self._workspace = kernel.workspace()
+        self._states = np.empty((1, kernel.robot.dof))
+        self.state, self.pairs = self._states[0], np.empty((MOST_PAIRS, 2), np.int64)
+        self._found, self._ends, self._counts = self.pairs[None], np.zeros(3, np.int64), np.zeros(5, np.int64)
+        self._two_starts, self._queue = np.empty(2, np.int64), np.empty((4096, 2), np.int64)
+
+    def check_state(self, kernel: Kernel, q: Array) -> int:
+        """Return the number of pairs that are not proved at a state, shape (dof,): as :meth:`Kernel.unproved` does."""
+        self.state[:] = q
+        queries.check_states(*kernel.packed, *self._workspace, self._states, self._found, self._ends[:1])
+        return int(self._ends[0])
+
+    def start(self, path: Array, resolution: float, states: Sequence[int] = (0, -1)) -> int:
+        """Start the check of a path; return the number of steps of the grid over it, or -1 where there is none.
+
+        Args:
+            path: States, shape (N, dof), N > 1, contiguous.
+            resolution: Largest spacing of the grid [rad, max-norm].
+            states: Given states that are checked too, first or last: 0 or -1.
+        """
+        starts = self._two_starts if len(path) == 2 else np.empty(len(path), np.int64)
+        last = int(motion_proof.lay_grid(path, resolution, starts))
         if last < 0:
-            return False
-        queue, ends, check_counts = np.empty((2 * last + 4, 2), np.int64), np.array([0, 1, 0]), np.zeros(5, np.int64)
-        queue[0] = 0, last
-        state = np.empty(self.robot.dof)
-        arrays = (states, starts, queue, ends, state, found[0], check_counts)
-        return bool(motion_proof.prove_path(*self.packed, *self.workspace(), *arrays) == motion_proof.DONE)
+            return last
+        queue = self._queue if len(self._queue) >= 2 * last + 4 else np.empty((2 * last + 4, 2), np.int64)
+        entered = [*((last, last) if k < 0 else (0, 0) for k in states), (0, last)]
+        queue[: len(entered)] = entered
+        self._ends[:2] = 0, len(entered)
+        self._counts[:] = 0
+        self._path, self._starts, self._open = path, starts, queue
+        return last
+
+    def first_unproved(self, kernel: Kernel) -> int | None:
+        """Return the number on the grid of the next state that is not proved free, which is in ``state``, or None."""
+        number = motion_proof.prove_path(
+            *kernel.packed, *self._workspace, self._path, self._starts, self._open, self._ends, self.state, self.pairs,
+            self._counts,
+        )  # fmt: skip
+        return None if number == motion_proof.DONE else int(number)
+
+    def segment(self, number: int) -> int:
+        """Return the segment of the path that a state of the grid lies on."""
+        return max(int(np.searchsorted(self._starts, number)) - 1, 0)
+
+    @property
+    def open_pairs(self) -> int:
+        """Number of pairs that are not proved at the state of :meth:`first_unproved`."""
+        return int(self._ends[2])
+
+    @property
+    def counts(self) -> PathCounts:
+        """Counts so far."""
+        return PathCounts(*self._counts.tolist())

@@ -1,4 +1,4 @@
-"""Matrix products and solutions for what paths depend on: the same bits on all processors, so that seeds repeat.
+"""Matrix products, solutions and dense layers: the same bits on all processors, so that seeds give the same paths.
 
 BLAS and LAPACK choose their code, and with it the order of sums, by the processor that they find.
 """
@@ -10,7 +10,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.kernel.compiled.matrix_products import factorize, matrix_products, solve_factored
+from apex_ompl.kernel.compiled.layout import Bytes, Singles
+from apex_ompl.kernel.compiled.network import dense_layer as compiled_layer
+from apex_ompl.kernel.compiled.packet.matrix_products import factorize, matrix_products, solve_factored
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
 
@@ -55,4 +57,18 @@ def solve(factor: Array, right: ArrayLike) -> Array:
     """Return the solutions X of L L^T X = R, shape (n, m), for a factor of :func:`cholesky`."""
     found = np.array(right, float, order="C")
     solve_factored(compact(factor), found)
+    return found
+
+
+def dense_layer(weight: Bytes, scale: Singles, bias: Singles, rows: Singles) -> Singles:
+    """Return rows (scale W)^T + bias, the output of a dense layer with weights in eight bits, shape (B, after).
+
+    Args:
+        weight: W, shape (after, before).
+        scale: Factor on each of its rows, shape (after,).
+        bias: Shape (after,).
+        rows: Shape (B, before).
+    """
+    found = np.empty((len(rows), len(weight)), np.float32)
+    compiled_layer.dense_layer(weight, scale, bias, rows, found)
     return found

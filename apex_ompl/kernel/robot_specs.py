@@ -1,4 +1,4 @@
-"""Joints and covered bodies, of which a robot's tables are made."""
+"""Joints and covered bodies, the input of a robot's tables."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, GRID_ROW, HALF_SPACE, SPHERE, SceneArrays
-from apex_ompl.kernel.compiled.grid_distance import SLACK
+from apex_ompl.kernel.compiled.geometry.grid_distance import SLACK
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
 from apex_ompl.kernel.distance_grid import DistanceGrid
 from apex_ompl.kernel.products import product
@@ -26,7 +26,7 @@ class Primitive(NamedTuple):
 
     Attributes:
         kind: BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE or GRID.
-        pose: Homogeneous transform in the world, shape (4, 4) [m]; that of a half-space is not looked at.
+        pose: Homogeneous transform in the world, shape (4, 4) [m]; that of a half-space is ignored.
         size: Half edges of a box; radius and half length along z; radius; or (unit normal, distance) of a half-space,
             the points x with normal . x <= distance [m]. Empty for a grid.
         grid: Distances from a surface or points in the frame of ``pose``.
@@ -106,7 +106,7 @@ class _Structure(NamedTuple):
 
     Attributes:
         skip: Next node outside of each node's subtree, nodes in depth-first order, shape (K,).
-        span: First solid below each node and the one behind the last, shape (K, 2).
+        span: First solid below each node and the one after the last, shape (K, 2).
         members: Number of solids of each leaf, 0 for inner nodes, shape (K,).
         levels: For each level but the last, the first solids of the parts that it is sorted in, and whether each part
             is sorted.
@@ -234,8 +234,8 @@ def moved(tables: SceneTables, owner: int, solids: Solids) -> SceneTables:
     low, high = arrays.tree_low.copy(), arrays.tree_high.copy()
     tree = _structure(len(arrays.kind) - int(arrays.open[0]))
     first, last = tree.span.T
-    behind = np.searchsorted(places, last)
-    for k in np.flatnonzero(np.searchsorted(places, first) < behind).tolist():
+    after = np.searchsorted(places, last)
+    for k in np.flatnonzero(np.searchsorted(places, first) < after).tolist():
         some = boxes[first[k] : last[k]]
         low[k], high[k] = some[:, 0].min(axis=0), some[:, 1].max(axis=0)
     arrays = arrays._replace(rotation=rotation, offset=offset, size=size, tree_low=low, tree_high=high)
@@ -257,7 +257,7 @@ def primitive(tables: SceneTables, k: int) -> Primitive:
 
 
 def joined(parts: Iterable[Solids]) -> Solids:
-    """Return solids one behind the other."""
+    """Return solids one after the other."""
     rows = list(parts) or [Solids.of(())]
     kind, exact, *floats = (np.concatenate(c) for c in zip(*(row[:-1] for row in rows), strict=True))
     rotation, offset, size, box = floats
@@ -268,7 +268,7 @@ def _boxes_of(tree: _Structure, boxes: Floats) -> tuple[Floats, Floats]:
     """Return the lowest and highest corners of a tree's boxes, each of shape (K, 3) [m]."""
     if not len(tree.skip):
         return np.empty((0, 3)), np.empty((0, 3))
-    low = np.append(boxes[:, 0], np.full((1, 3), np.inf), axis=0)  # no solid is behind the last
+    low = np.append(boxes[:, 0], np.full((1, 3), np.inf), axis=0)  # no solid is after the last
     high = np.append(boxes[:, 1], np.full((1, 3), -np.inf), axis=0)
     ends = tree.span.ravel()
     return np.minimum.reduceat(low, ends)[::2].copy(), np.maximum.reduceat(high, ends)[::2].copy()

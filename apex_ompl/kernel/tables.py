@@ -190,8 +190,8 @@ class SceneTables:
     Attributes:
         arrays: The arrays.
         boxes: Axis-aligned box around each solid, shape (n, 2, 3) [m]; empty unless obstacles may be moved.
-        rank: Place of each solid among those of its obstacle, shape (n,); likewise.
-        grids: Grid of each solid, if it has one; likewise.
+        rank: Place of each solid among those of its obstacle, shape (n,); empty unless obstacles may be moved.
+        grids: Grid of each solid, if it has one, n of them; empty unless obstacles may be moved.
         packed: The same as :func:`pack` returns them.
     """
 

@@ -5,7 +5,7 @@ It evaluates models of a linear latent space and an MLP denoiser. Names of weigh
 
 Large matrices of weights are int8 with a scale for each row: symmetric linear quantization (Jacob et al., CVPR 2018,
 with a zero point of 0). Reading weights from memory takes most of the time of a few proposals. NumPy's models compute
-with the bytes (:mod:`apex_ompl.kernel.compiled.dense_layer`), torch's with the expanded matrices.
+with the bytes (:func:`apex_ompl.kernel.products.dense_layer`), torch's with the expanded matrices.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.dense_layer import dense_layer
-from apex_ompl.kernel.products import product
+from apex_ompl.kernel.products import dense_layer, product
 from apex_ompl.model.config import OBSTACLE_SCENES, ModelConfig, key_shapes
 from apex_ompl.model.geometry import SHAPES, signed_distances
 from apex_ompl.model.guidance import Guidance, collision_cost
@@ -222,10 +221,8 @@ class ArrayModel(TrajectoryModel):
         weight, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
         if weight.dtype != np.int8:
             return np.asarray(product(values, weight.T) + bias, np.float32)
-        found = np.empty((len(values), len(weight)), np.float32)
         scale = self.weights[f"{name}.weight{SUFFIX}"]
-        dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32), found)
-        return found
+        return dense_layer(weight, scale, bias, np.ascontiguousarray(values, np.float32))
 
 
 def weight_shapes(config: ModelConfig) -> dict[str, tuple[int, ...]]:

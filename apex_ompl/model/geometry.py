@@ -40,7 +40,7 @@ def signed_distances(shape: Numbers, position: Numbers, rotation: Numbers, size:
     """Return signed distances [m] of points to obstacles, each with points of its own: shape (T, K).
 
     Arguments are all arrays, or all tensors. The formulas are those of the kernel, see
-    :mod:`apex_ompl.kernel.compiled.signed_distance`.
+    the kernel's (:mod:`apex_ompl.kernel.scene_distances`).
 
     Args:
         shape: Indices of shapes, shape (T,).

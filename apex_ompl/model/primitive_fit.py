@@ -17,11 +17,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, SPHERE
-from apex_ompl.kernel.compiled.grid_distance import SLACK
-from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
-from apex_ompl.kernel.compiled.layout import Integers
+from apex_ompl.kernel.arrays import BOX, CYLINDER, GRID_SLACK, SPHERE, Integers
 from apex_ompl.kernel.distance_grid import BAND, DistanceGrid
+from apex_ompl.kernel.geometry import OCCUPIED, OUTSIDE, best_box, label_regions, summed_volumes
 from apex_ompl.kernel.scene_builder import Primitive, primitive, scene_tables
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.geometry import signed_distances
@@ -179,21 +177,21 @@ class _Nodes:
         """Return the nodes of a grid."""
         if grid.radius > 0.0:  # points may be farther from each other than nodes
             block = max(1, math.ceil(CLOSE / grid.spacing))
-            reach = max((SLACK if block == 1 else MORE) * block * grid.spacing - grid.radius, 0.0)
+            reach = max((GRID_SLACK if block == 1 else MORE) * block * grid.spacing - grid.radius, 0.0)
         else:
             inside = (
                 float(grid.values.min()) < -INSIDE * grid.spacing
             )  # else it is a surface, in which nodes leave gaps
             most = MOST_NODES_OF_SOLIDS if inside else MOST_NODES
             block = min(math.ceil((grid.values.size / most) ** (1.0 / 3.0)), 3 if inside else 2)
-            reach = min(SLACK * block, BAND) * grid.spacing
-        slack, band = np.float32(SLACK * grid.spacing), (1.0 if grid.radius > 0.0 else BAND) - 1e-3
+            reach = min(GRID_SLACK * block, BAND) * grid.spacing
+        slack, band = np.float32(GRID_SLACK * grid.spacing), (1.0 if grid.radius > 0.0 else BAND) - 1e-3
         gap = grid.values[::block, ::block, ::block] + slack
         gap[gap > band * grid.spacing - grid.radius] += slack  # those were lowered once more
         near = gap <= reach
         near[[0, -1]] = near[:, [0, -1]] = near[:, :, [0, -1]] = False
         label = near.astype(np.int64)
-        label_regions(label, np.empty(label.size, np.int64))
+        label_regions(label)
         return cls(block * grid.spacing, gap, reach, label)
 
     def on_border(self) -> Flags:
@@ -296,15 +294,13 @@ def _one_shape(nodes: _Nodes, border: Flags, part: Integers) -> Solid | None:
 def _boxes(nodes: _Nodes, border: Flags, left: Integers, most: int) -> list[Solid]:
     """Return boxes along the axes that cover nearly all nonzero nodes of ``left``, which is overwritten."""
     least, ring = max(FEW, (LEAST_GAIN / nodes.spacing) ** 3), max(1, round(RING / nodes.spacing))
-    sums = np.zeros(tuple(n + 1 for n in left.shape), np.int64)
-    add_up(left, sums)
-    box, best = np.empty((2, 3), np.int64), np.empty((2, 3), np.int64)
+    sums = summed_volumes(left)
     rng = np.random.default_rng(0)
     found: list[Solid] = []
     remaining, uncovered = np.argwhere(left), left != 0
     while len(found) < most and len(remaining) > least:
         seeds = np.ascontiguousarray(remaining[rng.integers(len(remaining), size=SEEDS)])
-        gain = int(best_box(sums, left, seeds, LAYER, box, best))
+        gain, best = best_box(sums, left, seeds, LAYER)
         if gain < least:
             break
         found.append(_box_or_bar(nodes, border, _open_part(uncovered, best)))

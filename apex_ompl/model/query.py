@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import BOX, GRID, HALF_SPACE
+from apex_ompl.kernel.arrays import BOX, GRID, HALF_SPACE
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, primitive, tables_of
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.geometry import HeldExtent, ObstacleRecord, rotation_matrices

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.point_distances import group_clearances, nearest_points
 from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.kernel.scene_distances import group_clearances, nearest_points
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.config import HELD_FEATURES, PIECES
 from apex_ompl.model.geometry import HeldExtent

@@ -10,8 +10,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.ahead_of_time import compile_ahead
-from apex_ompl.kernel.compiled.entry_points import RUNS
+from apex_ompl.kernel.ahead_of_time import compile_for_runs
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
 from apex_ompl.moving.settings import LoopSettings
@@ -123,7 +122,7 @@ class RunContext:
 
     def __post_init__(self) -> None:
         """Compile the functions of runs, where that was not done yet."""
-        compile_ahead(RUNS)
+        compile_for_runs()
 
     @property
     def checker(self) -> CollisionChecker:

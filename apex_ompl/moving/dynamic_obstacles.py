@@ -16,8 +16,8 @@ from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError, SceneError, UnknownNameError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.dynamic_obstacles import DynamicArrays, clearances_in_time, first_conflict
-from apex_ompl.kernel.compiled.layout import pack, unpack
+from apex_ompl.kernel.arrays import DynamicArrays, pack, unpack
+from apex_ompl.kernel.moving import clearances_in_time, first_conflict
 from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there, obstacle_at, place_at, script_times, velocity_at
@@ -39,8 +39,7 @@ class DynamicObstacles:
 
     Attributes:
         names: Names of the obstacles.
-        arrays: Their solids, see
-            :class:`apex_ompl.kernel.compiled.dynamic_obstacles.DynamicArrays`; views of ``packed``.
+        arrays: Their solids, views of ``packed``.
         packed: The same arrays as compiled code takes them.
     """
 
@@ -224,8 +223,8 @@ def prove_motion(
     """Check a timed motion continuously among dynamic obstacles, and find the first moment that is not proved clear.
 
     The check is that of the sphere covers along the motion's own cubic pieces
-    (:mod:`apex_ompl.kernel.compiled.dynamic_obstacles`): it is sound and conservative by some millimeters. The scene of
-    the kernel and self-collision are not checked.
+    (:func:`apex_ompl.kernel.moving.first_conflict`): it is sound and conservative by some millimeters. The scene of the
+    kernel and self-collision are not checked.
 
     Args:
         kernel: The kernel of the robot with its held objects.
@@ -244,20 +243,12 @@ def prove_motion(
     until = motion.duration if end is None else end
     for name, value in (("start", start), ("end", until), ("clock", clock)):
         check_number(value, name)
-    curve = curve_of(motion)
-    found = np.empty(3, np.int64)
-    time = first_conflict(
-        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates, curve.slack,
-        float(start), float(until), float(clock), float(shortest),
-        np.empty((len(dynamic.arrays.kind), 3)), np.empty(kernel.robot.dof), found,
+    time, body, row, intervals = first_conflict(
+        kernel, dynamic.packed, curve_of(motion), start, until, clock, shortest
     )  # fmt: skip
-    body, dynamic_obstacle, intervals = found.tolist()
-    names = (
-        (kernel.robot.body_names[body], dynamic.names[dynamic_obstacle])
-        if body >= 0 and math.isfinite(time)
-        else ("", "")
-    )
-    return Conflict(float(time), *names, intervals)
+    found = body >= 0 and math.isfinite(time)
+    names = (kernel.robot.body_names[body], dynamic.names[row]) if found else ("", "")
+    return Conflict(time, *names, intervals)
 
 
 def clearance_in_time(
@@ -281,12 +272,7 @@ def clearance_in_time(
     """
     q, at = kernel.states(states), compact(finite_array(times, "times"))
     check_array(at, (len(q),), "times")
-    values, gradients = np.empty(len(q)), np.empty((len(q), q.shape[1] + 1))
-    clearances_in_time(
-        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), q, at, float(limit),
-        np.empty((len(dynamic.arrays.kind), 3)), values, gradients,
-    )  # fmt: skip
-    return values, gradients
+    return clearances_in_time(kernel, dynamic.packed, q, at, limit)
 
 
 def allowed_rows(kernel: Kernel, allowed: Iterable[tuple[str, str]], names: Sequence[str]) -> list[tuple[int, str]]:

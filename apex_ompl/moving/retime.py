@@ -15,14 +15,21 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.blocked_intervals import MOST_SPANS, blocked_intervals
-from apex_ompl.kernel.compiled.speed_profile import first_blocked, follow_profile, profile_places, push_bounds
-from apex_ompl.kernel.compiled.speed_search import MOST_TIMES, earliest_arrivals
+from apex_ompl.kernel.moving import (
+    BlockedPlaces,
+    LimitArrays,
+    SpeedSearch,
+    blocked_intervals,
+    earliest_arrivals,
+    first_blocked,
+    follow_profile,
+    profile_places,
+    push_bounds,
+)
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
-from apex_ompl.util.arrays import compact
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_number
 
@@ -148,13 +155,13 @@ class _Search:
         self, kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, limits: Limits, query: Query
     ) -> None:
         """Find the blocked intervals."""
-        self.motion, self.limits = motion, limits
+        self.motion, self.limits = motion, LimitArrays.of(limits)
         self.time, self.clock, self.hold, horizon, self.deviation = query
         self.latest, time = self.clock + horizon, self.time
         left = motion.duration - time
         self.stages = int(np.clip(math.ceil(left / STAGE), *STAGES))
         self.length = left / self.stages
-        self.points = time + self.length * np.arange(self.stages + 1)
+        self.points: Array = np.asarray(time + self.length * np.arange(self.stages + 1), float)
         edges = self.points[:-1, None] + self.length / PIECES * np.arange(PIECES)
         edges = np.append(edges.ravel(), self.points[-1])
         where = np.stack([edges[:-1], edges[1:]], axis=1), np.stack([self.points, self.points], axis=1)
@@ -196,21 +203,15 @@ class _Search:
 
     def _profile(self, attempt: Attempt) -> Profile | None:
         """Return the profile with the earliest arrival, or None."""
-        x, points = self._levels() if attempt.hurries else SLOW, self.stages + 1
-        limits, window = self.limits, PUSHING * max(attempt.window, 2.0 * SPACINGS[0])
-        lowest, highest = np.empty((2, self.rates.shape[1], len(x)))
-        bounds = map(compact, (limits.velocity, attempt.share * limits.acceleration, limits.jerk))
-        push_bounds(self.rates, *bounds, self.length / PIECES, window, x, lowest, highest)
-        levels, departures = np.empty(points, np.int64), np.empty((points, 2))
-        found = earliest_arrivals(
+        x, window = self._levels() if attempt.hurries else SLOW, PUSHING * max(attempt.window, 2.0 * SPACINGS[0])
+        limits = self.limits._replace(acceleration=attempt.share * self.limits.acceleration)
+        search = SpeedSearch(
             self.pieces.longer(attempt.margin), self.pieces.counts, self.stops.longer(attempt.margin),
-            self.stops.counts, lowest, highest, x, self.length, UNIT, self.rests,
-            max(attempt.forced, 2 * self.rests), self.clock, self.latest, self.hold,
-            np.empty((points, len(x), MOST_TIMES, 2)), np.empty((points, len(x)), np.int64),
-            np.empty((points, MOST_TIMES, 2)), np.empty(points, np.int64), np.empty((4 * MOST_TIMES, 2)),
-            np.empty(PIECES + 1), levels, departures,
+            self.stops.counts, *push_bounds(self.rates, limits, self.length / PIECES, window, x), x, self.length, UNIT,
+            self.rests, max(attempt.forced, 2 * self.rests), self.clock, self.latest, self.hold, PIECES,
         )  # fmt: skip
-        return Profile(x, levels, departures) if found else None
+        found = earliest_arrivals(search)
+        return Profile(x, *found) if found else None
 
     def _motions(self, profile: Profile, window: float) -> Iterator[Retimed]:
         """Yield motions with a profile that keep the limits, the deviation and the safe intervals."""
@@ -249,8 +250,7 @@ class _Search:
         x, levels, departures = profile
         half = round(window / h) // 2
         count = max(math.ceil((departures[-1, 0] - start) / h - SAME_TIME) + half, 2)
-        places = np.empty(count + 1)
-        profile_places(x, self.length, self.time, levels, departures, start, h, places)
+        places = profile_places(x, self.length, self.time, (levels, departures), start, h, count + 1)
         places[-1] = self.points[-1]
         if not half:
             return places
@@ -267,15 +267,10 @@ class _Search:
 
     def _followed(self, start: float, places: Array, h: float) -> tuple[Array, Array, float] | None:
         """Return times, states and deviation of the motion with places h apart in time, where it keeps the limits."""
-        dof, limits, size = self.motion.dof, self.limits, len(places) + 1
-        control, off, times, out = np.empty((size + 2, dof)), np.empty(dof), np.empty(size), np.empty((3, size, dof))
-        bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
-        count = follow_profile(
-            compact(self.motion.times), self.states, float(start), places, h, *bounds, np.empty((3, dof)), control, off,
-            times, out,
-        )  # fmt: skip
-        if not count:
+        found = follow_profile(self.motion.times, self.states, start, places, h, self.limits)
+        if found is None:
             return None
+        times, out, off = found
         step = float(np.diff(places).max())  # the motion and the path both curve between two knots
         off += (h * h * np.abs(out[2]).max(axis=0) + step * step * np.abs(self.states[2]).max(axis=0)) / 8.0
         return (times, out, float(off.max())) if off.max() <= self.deviation else None
@@ -297,9 +292,8 @@ class _Search:
 
     def _free(self, places: Array, start: float, h: float) -> bool:
         """Whether places at times h apart are outside of blocked intervals; the end also while it must stay free."""
-        step = first_blocked(
-            *self.pieces, self.points, self.stops.spans, self.stops.counts, places, float(start), h
-        )  # fmt: skip
+        blocked_places = BlockedPlaces(*self.pieces, self.points, self.stops.spans, self.stops.counts)
+        step = first_blocked(blocked_places, places, start, h)
         end = start + len(places) * h
         return step < 0 and (
             places[-1] < self.points[-1] or not self.stops.meets(self.stages, end - h, end + self.hold)
@@ -311,7 +305,7 @@ class Blocked(NamedTuple):
 
     Attributes:
         places: Starts and ends of the places, in the motion's own time, shape (P, 2) [s].
-        spans: Their blocked intervals in order, shape (P, MOST_SPANS, 2) [s of the dynamic obstacles' stamps].
+        spans: Their blocked intervals in order, shape (P, most, 2) [s of the dynamic obstacles' stamps].
         counts: Numbers of these intervals, shape (P,).
     """
 
@@ -352,10 +346,4 @@ def blocked(
         end: Last time [s].
         slack: Largest distance of each joint from the path [rad].
     """
-    curve, dof = curve_of(motion), motion.dof
-    spans, counts = np.zeros((len(places), MOST_SPANS, 2)), np.empty(len(places), np.int64)
-    blocked_intervals(
-        *kernel.robot.packed, *dynamic.packed, *kernel.workspace(), curve.knots, curve.states, curve.rates,
-        curve.slack + slack, places, float(start), float(end), np.empty(dof), spans, counts,
-    )  # fmt: skip
-    return Blocked(places, spans, counts)
+    return Blocked(places, *blocked_intervals(kernel, dynamic.packed, curve_of(motion), places, (start, end), slack))

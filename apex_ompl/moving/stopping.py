@@ -7,14 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.path_stop import MOST_STEPS, stop_on_path
-from apex_ompl.kernel.compiled.stop_profiles import PHASES, stop_joints
-from apex_ompl.kernel.compiled.stops_among_dynamic_obstacles import first_unproved_stop
+from apex_ompl.kernel.moving import LimitArrays, StopSeries, first_unproved_stop, stop_joints, stop_on_path
 from apex_ompl.moving.dynamic_obstacles import SHORTEST, DynamicObstacles, curve_of
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Flags
-from apex_ompl.util.arrays import compact
 from apex_ompl.util.display import fields_line
 
 DEVIATION = 1e-3  # largest distance of a stop from the path [rad]
@@ -49,7 +46,7 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
     """Return the soonest stop from a state, joint by joint.
 
     It is what Ruckig's velocity interface finds (Berscheid and Kroeger 2021), in closed form:
-    :mod:`apex_ompl.kernel.compiled.stop_profiles`. A joint whose soonest stop would pass a position limit brakes for
+    :func:`apex_ompl.kernel.moving.stop_joints`. A joint whose soonest stop would pass a position limit brakes for
     longer, so that it keeps the limit, and swings back. The limits of acceleration and jerk are kept; that of velocity
     is kept where this is possible, i.e. where |v + a |a| / (2 J)| is within it.
 
@@ -60,19 +57,15 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
         velocity: Within the limits, shape (dof,) [rad/s].
         acceleration: Within the limits, shape (dof,) [rad/s^2].
     """
-    dof = len(position)
-    lengths, jerks, beyond = np.empty((dof, PHASES)), np.empty((dof, PHASES)), np.empty(dof)
-    times, knots = np.empty(dof * PHASES + 2), np.empty((3, dof * PHASES + 2, dof))
-    state, bounds = (position, velocity, acceleration), (limits.lower, limits.upper, limits.acceleration, limits.jerk)
-    count = stop_joints(*map(compact, (*state, *bounds)), lengths, jerks, times, knots, beyond)
-    return Stop(Trajectory.unchecked(times[:count], knots[:, :count], joint_names), beyond, np.inf)
+    times, knots, beyond = stop_joints(position, velocity, acceleration, LimitArrays.of(limits))
+    return Stop(Trajectory.unchecked(times, knots, joint_names), beyond, np.inf)
 
 
 def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float = DEVIATION) -> Stop:
     """Return the soonest stop along the path of a motion, among profiles of slowing down.
 
     It starts with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
-    and is the rest of the motion itself where no profile ends sooner (:mod:`apex_ompl.kernel.compiled.path_stop`).
+    and is the rest of the motion itself where no profile ends sooner (:func:`apex_ompl.kernel.moving.stop_on_path`).
 
     Args:
         motion: A motion within the limits that ends at rest.
@@ -80,16 +73,12 @@ def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float
         limits: Limits of the joints.
         deviation: Largest distance of any joint from the path [rad].
     """
-    dof = motion.dof
-    states = np.stack([motion.positions, motion.velocities, motion.accelerations])
-    room = len(motion.times) + MOST_STEPS + 4
-    start, control, work, still = np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty((2, dof)), np.zeros(dof)
-    times, knots = np.empty(room), np.empty((3, room, dof))
-    bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
-    count = stop_on_path(compact(motion.times), states, time, start, *bounds, deviation, control, *work, times, knots)
-    if not count:
+    states, still = np.stack([motion.positions, motion.velocities, motion.accelerations]), np.zeros(motion.dof)
+    found = stop_on_path(motion.times, states, time, LimitArrays.of(limits), deviation)
+    if found is None:
         return Stop(motion.after(time), still, 0.0)
-    return Stop(Trajectory.unchecked(times[:count], knots[:, :count], motion.joint_names), still, float(work[1].max()))
+    times, knots, apart = found
+    return Stop(Trajectory.unchecked(times, knots, motion.joint_names), still, apart)
 
 
 def stops_proved(
@@ -114,19 +103,9 @@ def stops_proved(
         growth: Margin of observed places [m], and its growth since the observation [m/s].
         period: Time from a moment to the stop [s].
     """
-    dof, curve, a, seen = motion.dof, curve_of(motion), expected.arrays, expected.with_margin(*growth)
-    states = np.stack([motion.positions, motion.velocities, motion.accelerations])
-    room, dynamic = max(len(motion.times) + MOST_STEPS + 4, dof * PHASES + 2), len(a.kind)
-    by_joints = np.zeros(len(moments), np.int64)
-    bounds = map(compact, (limits.lower, limits.upper, limits.velocity, limits.acceleration, limits.jerk))
-    count = int(
-        first_unproved_stop(
-            *kernel.robot.packed, *seen.packed, *kernel.workspace(), a.place, a.velocity, a.stamp, float(age),
-            curve.knots, curve.states, curve.rates, curve.slack, states, *bounds, DEVIATION, compact(moments),
-            by_joints, float(period), float(clock), SHORTEST, np.empty((dynamic, 3)), np.empty(dof),
-            np.empty(3, np.int64), np.empty((3, dof)), np.empty((MOST_STEPS + 4, dof)), np.empty(dof), np.empty(dof),
-            np.empty((2, dof, PHASES)), np.empty(room), np.empty((3, room, dof)), np.empty((room, dof)),
-            np.empty((room, 2 * dof)),
-        )
+    series = StopSeries(
+        expected.arrays, expected.with_margin(*growth).packed, age, curve_of(motion),
+        np.stack([motion.positions, motion.velocities, motion.accelerations]), LimitArrays.of(limits), DEVIATION,
+        moments, period, clock, SHORTEST,
     )  # fmt: skip
-    return count, by_joints.astype(bool)
+    return first_unproved_stop(kernel, series)

@@ -11,12 +11,11 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.motion_optimization import WIDTH, optimize_motion
-from apex_ompl.kernel.compiled.path_cost import CostSettings, PathReport, optimization_buffer_sizes
+from apex_ompl.kernel.moving import SAMPLE_WIDTH, MotionCost, optimize_motion
+from apex_ompl.kernel.path import CostSettings, PathGrid, PathReport
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.robot.model import Limits
@@ -147,7 +146,7 @@ class TimedSpline(NamedTuple):
 class MotionOptimizer:
     """Levenberg-Marquardt on splines in time, among static and dynamic obstacles; without random numbers of its own.
 
-    The cost is that of :mod:`apex_ompl.kernel.compiled.motion_optimization`.
+    The cost is that of :class:`apex_ompl.kernel.moving.MotionCost`.
 
     Attributes:
         samples: Number of samples of all steps so far.
@@ -237,23 +236,16 @@ class MotionOptimizer:
             raise ParameterError("control points", points, f"more than {2 * PINNED}")
         check_array(control, ("P", dof), "control points", finite=True)
         s, limits = self.settings, self.limits
-        weights, first, gram = _grid(points, s.samples)
-        times = clock + (np.arange(len(weights)) + 0.5) / len(weights) * spline.duration
+        grid = _grid(points, s.samples)
+        times = clock + (np.arange(len(grid.weights)) + 0.5) / len(grid.weights) * spline.duration
         powers = np.power(spline.spacing, [[1.0], [2.0], [3.0]])
         most = s.limit_share * powers * np.stack([limits.velocity, limits.acceleration, limits.jerk])
-        integers, floats = optimization_buffer_sizes((points - 2 * PINNED) * dof, points, dof)
-        slope = np.empty(slopes)
-        report = optimize_motion(
-            *self.kernel.packed, *self.dynamic.packed, *self.kernel.workspace(),
-            np.empty((len(self.dynamic.arrays.kind), 3)), weights, first, gram, times, most, float(s.limit_weight),
-            PINNED, control, tuple(self._numbers(steps, enough, damping)), np.empty(integers, np.int64),
-            np.empty(floats), slope,
-        )  # fmt: skip
-        made = PathReport(*report)
-        self.samples += (made.steps + 1) * len(times)
-        return spline._replace(control=control), made, slope
+        cost = MotionCost(grid, times, most, s.limit_weight, self._cost_settings(steps, enough, damping))
+        report, slope = optimize_motion(self.kernel, self.dynamic.packed, cost, PINNED, control, slopes)
+        self.samples += (report.steps + 1) * len(times)
+        return spline._replace(control=control), report, slope
 
-    def _numbers(self, steps: int, enough: float, damping: float | None) -> CostSettings:
+    def _cost_settings(self, steps: int, enough: float, damping: float | None) -> CostSettings:
         s = self.settings
         return CostSettings(
             float(s.scene_margin), float(s.own_margin), float(s.stiffness),
@@ -262,19 +254,19 @@ class MotionOptimizer:
 
 
 @lru_cache(maxsize=64)
-def _grid(points: int, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
+def _grid(points: int, samples: int) -> PathGrid:
     """Return weights at the samples, where they start, and the matrix of the speed over the share of the motion."""
     spans = points - PINNED
     at = (np.arange(samples) + 0.5) / samples
     weights = np.tile(_basis(at), (spans, 1))
     first = np.repeat(np.arange(spans), samples)
-    nodes, shares = np.polynomial.legendre.leggauss(WIDTH)
+    nodes, shares = np.polynomial.legendre.leggauss(SAMPLE_WIDTH)
     slopes = _slopes((nodes + 1.0) / 2.0) * spans
     block = (slopes.T * (shares / 2.0 / spans)) @ slopes
     gram = np.zeros((points, points))
     for k in range(spans):
-        gram[k : k + WIDTH, k : k + WIDTH] += block
-    return np.ascontiguousarray(weights), first.astype(np.int64), gram
+        gram[k : k + SAMPLE_WIDTH, k : k + SAMPLE_WIDTH] += block
+    return PathGrid(np.ascontiguousarray(weights), first.astype(np.int64), gram)
 
 
 def _basis(x: Array) -> Array:

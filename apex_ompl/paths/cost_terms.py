@@ -4,9 +4,9 @@ A term is a function of states q that returns residuals r(q) and their Jacobians
 
     1 / (2 N) sum_k |r(q(u_k))|^2
 
-to the cost of :mod:`apex_ompl.kernel.compiled.path_cost`, at the same N samples of the path q(u) = sum_i B_i(u) P_i.
+to the cost of :func:`apex_ompl.kernel.path.path_cost`, at the same N samples of the path q(u) = sum_i B_i(u) P_i.
 Its gradient with respect to control point P_i is 1/N sum_k B_i(u_k) J_k^T r_k. Its Gauss-Newton matrix has the blocks
-1/N sum_k B_i(u_k) B_j(u_k) J_k^T J_k. The steps are those of :mod:`apex_ompl.kernel.compiled.path_optimization`.
+1/N sum_k B_i(u_k) B_j(u_k) J_k^T J_k. The steps are those of :func:`apex_ompl.kernel.path.optimize_path`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.path_cost import CostSettings, PathReport
-from apex_ompl.kernel.compiled.path_optimization import LEAST_DAMPING, MOST_DAMPING
+from apex_ompl.kernel.path import LEAST_DAMPING, MOST_DAMPING, CostSettings, PathReport
 from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array

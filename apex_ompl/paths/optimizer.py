@@ -15,15 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.layout import new_buffers
-from apex_ompl.kernel.compiled.path_cost import (
-    Buffers,
-    CostSettings,
-    PathReport,
-    optimization_buffer_sizes,
-    path_cost,
-)
-from apex_ompl.kernel.compiled.path_optimization import optimize_path
+from apex_ompl.kernel.path import CostSettings, PathGrid, PathReport, optimization_buffers, optimize_path, path_cost
 from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.paths.cost_terms import CostTerm, Evaluation, add_terms, descend
 from apex_ompl.paths.spline import Spline
@@ -113,7 +105,7 @@ class Optimizer:
     """Levenberg-Marquardt on control points of batches of paths; thread-safe, without random numbers of its own.
 
     The cost is the squared speed and the squared violations of the margins, see
-    :mod:`apex_ompl.kernel.compiled.path_cost`, and the terms that are given. Limits are kept by the control points.
+    :func:`apex_ompl.kernel.path.path_cost`, and the terms that are given. Limits are kept by the control points.
     """
 
     def __init__(
@@ -223,15 +215,14 @@ class Optimizer:
         if self.costs:
             first = (settings._replace(damping=float(one)) for one in dampings)
             return self._result(control, list(map(self._descend, each, control, first)))
-        buffers = self._buffers(each[0]) if each else ()
+        buffers = optimization_buffers(self.spline.pinned, self.spline.points, control.shape[-1])
         reports = [
             optimize_path(
-                *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, points,
-                tuple(settings._replace(damping=float(first))), *buffers,
+                kernel, grid, self.spline.pinned, points, settings._replace(damping=float(first)), buffers
             )
             for kernel, points, first in zip(each, control, dampings, strict=True)
         ]  # fmt: skip
-        return self._result(control, [PathReport(*report) for report in reports])
+        return self._result(control, reports)
 
     def shorten(
         self, kernel: Kernel, control: ArrayLike, is_valid: Check, stop: Callable[[], bool] = lambda: False
@@ -275,17 +266,8 @@ class Optimizer:
 
     def _evaluate(self, kernel: Kernel, control: Array, settings: CostSettings) -> Evaluation:
         """Return cost, gradient and Gauss-Newton matrix of control points, shape (points, dof), all terms included."""
-        points, dof = control.shape
         samples = self.settings.samples
-        grid = _grid(self.spline, samples)
-        integers, floats, buffers = new_buffers(Buffers, unknowns=self.spline.free * dof, points=points, dof=dof)
-        gradient = np.empty(self.spline.free * dof)
-        report = path_cost(
-            *kernel.packed, *kernel.workspace(), *grid, self.spline.pinned, control, tuple(settings), integers, floats,
-            gradient,
-        )  # fmt: skip
-        upper = np.triu(buffers.gram[0])
-        evaluation = PathReport(*report), gradient, upper + np.triu(upper, 1).T
+        evaluation = path_cost(kernel, _grid(self.spline, samples), self.spline.pinned, control, settings)
         if not self.costs:
             return evaluation
         weights = self.spline.basis((np.arange(samples) + 0.5) / samples)
@@ -325,11 +307,6 @@ class Optimizer:
             steps=int(s.steps if steps is None else steps),
         )
 
-    def _buffers(self, kernel: Kernel) -> tuple[NDArray[np.int64], Array]:
-        dof = kernel.robot.dof
-        integers, floats = optimization_buffer_sizes(self.spline.free * dof, self.spline.points, dof)
-        return np.empty(integers, np.int64), np.empty(floats)
-
     @staticmethod
     def _result(control: Array, reports: Sequence[PathReport]) -> OptimizationResult:
         return OptimizationResult(
@@ -343,13 +320,13 @@ class Optimizer:
 
 
 @lru_cache(maxsize=32)
-def _grid(spline: Spline, samples: int) -> tuple[Array, NDArray[np.int64], Array]:
+def _grid(spline: Spline, samples: int) -> PathGrid:
     """Return the nonzero weights at the samples, the first control point of each, and the Gram matrix of the speed."""
     weights = spline.basis((np.arange(samples) + 0.5) / samples)
     width = spline.degree + 1
     first = np.minimum(np.argmax(weights != 0.0, axis=1), spline.points - width).astype(np.int64)
     packed = np.take_along_axis(weights, first[:, None] + np.arange(width), axis=1)
-    return np.ascontiguousarray(packed), first, np.ascontiguousarray(spline.gram(1))
+    return PathGrid(np.ascontiguousarray(packed), first, np.ascontiguousarray(spline.gram(1)))
 
 
 @lru_cache(maxsize=32)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from apex_ompl.kernel.compiled.polyline_distance import max_distance
 from apex_ompl.kernel.products import product
+from apex_ompl.kernel.timing import max_distance
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.validation import number_array
@@ -154,7 +154,7 @@ def deviation_bound(
         if len(line.states) == 1:
             farthest = float(np.linalg.norm(points - line.states[0], axis=1).max())
         else:
-            farthest = float(max_distance(points, np.interp(some, *arc_at), line.states, line.arc, window))
+            farthest = max_distance(points, np.interp(some, *arc_at), line.states, line.arc, window)
         distance = max(distance, farthest)
         step = max(step, float(np.linalg.norm(np.diff(points, axis=0), axis=1).max()))
     return distance + step / 2.0

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
-from apex_ompl.kernel.compiled.cubic_pieces import cubic_rates
-from apex_ompl.kernel.compiled.polyline_distance import max_distance
-from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.kernel.products import cholesky, solve
+from apex_ompl.kernel.timing import arc_lengths, cubic_rates, max_distance, max_path_speeds
 from apex_ompl.paths.path import Path
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import ruckig_method, spline_method
@@ -302,13 +300,11 @@ def _lasting(motion: Trajectory, duration: float) -> Trajectory:
 @cache
 def warm_up() -> None:
     """Load the compiled code: about 10 ms in each process, or a few seconds when it must be compiled first."""
-    x = np.empty(3)
-    max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0, x)
-    sample_times(x, 1.0, 1.0, np.empty(1))
+    arc_lengths(max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0), 1.0, 1.0, 1)
     max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
     still = Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False)
     motion = joined(still, np.zeros((3, 2, 1)), ("joint",))
     Trajectory(*motion.knots, ("joint",)).states(motion.times)
     Extremes.of(*motion.knots)
-    cubic_rates(*motion.knots, np.empty((len(motion.times), 2)))
+    cubic_rates(motion.knots)
     solve(cholesky(np.eye(1)), np.ones((1, 1)))  # for spline fits

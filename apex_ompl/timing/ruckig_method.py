@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple, Self
@@ -11,7 +10,7 @@ import numpy as np
 import ruckig
 
 from apex_ompl.errors import TimingError
-from apex_ompl.kernel.compiled.jerk_profiles import SPLITS, TICK, join_profiles
+from apex_ompl.kernel.timing import TICK, join_profiles
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.curve import Polyline, deviation_bound
 from apex_ompl.timing.spline_method import blend
@@ -103,13 +102,7 @@ def joined(profiles: Profiles, states: Array, joint_names: tuple[str, ...]) -> T
         joint_names: Names of the joints.
     """
     starts = np.round(np.cumsum([0.0, *profiles.durations]) / TICK).astype(np.int64)
-    problems, dof, phases = profiles.phases.shape
-    shape = problems, dof, phases + SPLITS - 1
-    room = np.empty(shape, np.int64), np.empty((4, *shape)), np.empty(dof * shape[2], np.int64)
-    times = np.empty(math.prod(shape) + 1)
-    at = np.empty((3, len(times), dof))
-    found = join_profiles(profiles.phases, profiles.jerks, starts, np.ascontiguousarray(states), *room, times, at)
-    return Trajectory.unchecked(times[:found].copy(), at[:, :found].copy(), joint_names)
+    return Trajectory.unchecked(*join_profiles(profiles.phases, profiles.jerks, starts, states), joint_names)
 
 
 def blended(

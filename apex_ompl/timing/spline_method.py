@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.polyline_distance import max_distance
-from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
+from apex_ompl.kernel.timing import arc_lengths, curve_duration, max_distance, max_path_speeds
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.curve import Curve, Polyline, deviation_bound
 from apex_ompl.timing.trajectory import Trajectory
@@ -59,7 +58,7 @@ def blend(
 
     1. A uniform cubic B-spline q(s) along the polyline rounds its corners (:class:`apex_ompl.timing.curve.Curve`).
     2. Reachability analysis gives the largest speeds along q(s) within the limits of velocity and acceleration
-       (:mod:`apex_ompl.kernel.compiled.time_parameterization`; Pham and Pham 2018).
+       (:func:`apex_ompl.kernel.timing.max_path_speeds`; Pham and Pham 2018).
     3. States at times h apart on that motion are the control points of a uniform cubic B-spline in time. Averages of
        states within the limits are within the limits, and the jerk is at most 2 a_max / h. In step 2 the limit of
        acceleration is min(a_max, j_max h); h is stretched where a limit is still exceeded.
@@ -83,7 +82,6 @@ def blend(
     grid = np.linspace(0.0, line.length, len(first))
     if max_distance(curve.points(grid), grid, line.states, line.arc, window) > deviation:
         return None
-    squared_speed = np.empty(len(first))
     tried: dict[int, tuple[float, Array, Array]] = {}  # least knot spacing [s], control points, their arc lengths
 
     def duration_with(index: int) -> float:
@@ -91,11 +89,10 @@ def blend(
         if index not in tried:
             spacing = KNOT_SPACINGS[index]
             acceleration = np.minimum(limits.acceleration, limits.jerk * spacing)
-            max_path_speeds(first, second, limits.velocity, acceleration, step, squared_speed)
-            duration = sample_times(squared_speed, step, 0.0, np.empty(0))
+            squared_speeds = max_path_speeds(first, second, limits.velocity, acceleration, step)
+            duration = curve_duration(squared_speeds, step)
             count = max(1, int(duration / spacing))
-            arc = np.empty(count + 1)
-            sample_times(squared_speed, step, duration / count, arc)
+            arc = arc_lengths(squared_speeds, step, duration / count, count + 1)
             arc[-1] = line.length
             points = curve.points(arc)
             points[0], points[-1] = line.states[0], line.states[-1]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.kernel.compiled.cubic_pieces import motion_extremes, relative_gap, sample_motion
+from apex_ompl.kernel.timing import motion_extremes, relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.files import STATES, SUFFIXES, decode, encode
 from apex_ompl.timing.smoothness import spectral_arc_length
@@ -46,7 +46,7 @@ class Extremes(NamedTuple):
 
     @classmethod
     def of(cls, times: Array, positions: Array, velocities: Array, accelerations: Array) -> Self:
-        """Return the extremes of a motion: :mod:`apex_ompl.kernel.compiled.cubic_pieces`.
+        """Return the extremes of a motion: :func:`apex_ompl.kernel.timing.motion_extremes`.
 
         Args:
             times: Times of the knots, shape (K,) [s].
@@ -54,9 +54,7 @@ class Extremes(NamedTuple):
             velocities: At the knots, shape (K, dof).
             accelerations: At the knots, shape (K, dof).
         """
-        found = np.empty((len(cls._fields), positions.shape[1]))
-        motion_extremes(times, positions, velocities, accelerations, found)
-        return cls(*found)
+        return cls(*motion_extremes((times, positions, velocities, accelerations)))
 
     def slower(self, factor: float) -> Self:
         """Return the extremes of the same motion in a time that is ``factor`` times as long."""
@@ -122,7 +120,7 @@ class Trajectory:
         check_times(self.times)
         for name in STATES:
             check_array(getattr(self, name), (len(self.times), len(names)), name)
-        if relative_gap(*self.knots) <= CONTINUITY_TOLERANCE:
+        if relative_gap(self.knots) <= CONTINUITY_TOLERANCE:
             return
         q, v, a, t = self.positions, self.velocities, self.accelerations, np.diff(self.times)[:, None]
         reached = q[:-1] + t * (v[:-1] + t * (2.0 * a[:-1] + a[1:]) / 6.0), v[:-1] + t * (a[:-1] + a[1:]) / 2.0
@@ -197,16 +195,13 @@ class Trajectory:
         given = finite_array(time, "time")
         if given.ndim > 1:
             raise ParameterError("time", given.shape, "one time, or several of shape (N,)")
-        out = np.empty((1, given.size, self.dof))
-        sample_motion(*self.knots, np.atleast_1d(given), order, out)
-        values: Array = out[0, 0] if given.ndim == 0 else out[0]
+        rows = sample_motion(self.knots, np.atleast_1d(given), order)
+        values: Array = rows[0, 0] if given.ndim == 0 else rows[0]
         return values
 
     def states(self, times: Array) -> Array:
         """Return positions, velocities and accelerations at finite times, shape (N,) [s], in one, shape (3, N, dof)."""
-        out = np.empty((len(STATES), len(times), self.dof))
-        sample_motion(*self.knots, times, 0, out)
-        return out
+        return sample_motion(self.knots, times, count=len(STATES))
 
     def sample(self, spacing: float) -> Sample:
         """Return states at a spacing in time, and at the end.

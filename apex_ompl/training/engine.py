@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.shortcuts import ENOUGH, RESOLUTION, shortcut
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
 from apex_ompl.model.geometry import ObstacleRecord
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer

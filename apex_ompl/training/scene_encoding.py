@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE
-from apex_ompl.kernel.obstacle_batch import ObstacleBatch
+from apex_ompl.kernel.arrays import FIXED, REVOLUTE
+from apex_ompl.kernel.scene_distances import ObstacleBatch
 from apex_ompl.model.config import PIECES
 from apex_ompl.model.geometry import SHAPES, signed_distances
 from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from apex_ompl import load_problem, problems
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.kernel.compiled.separation import COLLIDES
+from apex_ompl.kernel.kernel import COLLIDES
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.util.entry_point import run_script

@@ -75,7 +75,7 @@ def call(self, *arguments):
     return self.dispatcher(*arguments)
 
 original, jit.CompiledFunction.__call__ = jit.CompiledFunction.__call__, call
-jit.CompiledFunction.key = property(lambda self: f"{self.__module__.rpartition('.')[2]}.{self.name}")
+jit.CompiledFunction.key = property(lambda self: f"{self.__module__.removeprefix(library.PACKAGE + '.')}.{self.name}")
 
 model, ready = load_model("apex"), assemble(problems.load("shelf/hard/800003"), robot())
 kernel, optimizer = ready.checker.kernel, Optimizer(model.spline)
@@ -87,11 +87,10 @@ states = np.concatenate(paths)
 free = states[kernel.unproved(states)[1] == 0][:1024].copy()
 drawn = np.random.default_rng(1).uniform(limits.lower, limits.upper, (1000, len(limits.lower)))
 proved = [p for p in paths if kernel.proves(p, 0.02)][:4] or paths[:4]
-from apex_ompl.kernel.compiled import dense_layer
+from apex_ompl.kernel.products import dense_layer
 rng = np.random.default_rng(2)
 layer = rng.integers(-99, 99, (512, 512)).astype(np.int8), *rng.normal(size=(2, 512)).astype(np.float32)
 rows = rng.normal(size=(8, 512)).astype(np.float32)
-after = np.empty((8, 512), np.float32)
 suites, levels = ("shelf", "posts", "cage", "swap"), ("medium", "hard")
 names = [f"{suite}/{level}/80000{k}" for suite in suites for level in levels for k in (0, 1)]
 tests = {
@@ -100,7 +99,7 @@ tests = {
     "clearance and gradient of a state [us]": (lambda: kernel.clearance_gradient(free[:200], 0.1), 200, 1e6),
     "a path proved [us]": (lambda: [kernel.proves(p, 0.02) for p in proved], len(proved), 1e6),
     "a step of the optimizer [us]": (lambda: optimizer.improve(kernel, starts, steps=12), int(near.steps.sum()), 1e6),
-    "a dense layer, 512 by 512, 8 rows [us]": (lambda: dense_layer.dense_layer(*layer, rows, after), 1, 1e6),
+    "a dense layer, 512 by 512, 8 rows [us]": (lambda: dense_layer(*layer, rows), 1, 1e6),
     "a call of one state [us]": (lambda: kernel.unproved(free[:1]), 1, 1e6),
     "a plan, median of 16 problems [ms]": (None, 1, 1e3),
 }

@@ -24,10 +24,10 @@ from apex_ompl import load_model, problems
 from apex_ompl.apex.query import make_query
 from apex_ompl.kernel.compiled.arrays import robot_view
 from apex_ompl.kernel.compiled.compilation import entry_point, reassociating_entry_point
-from apex_ompl.kernel.compiled.kinematics import place_cluster, place_robot
 from apex_ompl.kernel.compiled.layout import Floats, Integers
-from apex_ompl.kernel.compiled.path_cost import PANEL, add_sample
-from apex_ompl.kernel.compiled.path_optimization import _factorize
+from apex_ompl.kernel.compiled.path.path_cost import PANEL, add_sample
+from apex_ompl.kernel.compiled.path.path_optimization import _factorize
+from apex_ompl.kernel.compiled.robot.kinematics import place_cluster, place_robot
 from apex_ompl.kernel.compiled.workspace import workspace_view
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.optimizer import Optimizer, _grid

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from apex_ompl import problems
 from apex_ompl.apex.trees import ompl_trees
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import path_to_array

@@ -36,7 +36,7 @@ from tqdm import tqdm
 
 from apex_ompl import plan, problems
 from apex_ompl.errors import TimingError
-from apex_ompl.kernel.compiled.polyline_distance import max_distance
+from apex_ompl.kernel.timing import max_distance
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
@@ -108,7 +108,7 @@ def deviation_of(motion: Trajectory, path: np.ndarray) -> float:
     """Return the largest distance of samples from a path [rad]."""
     line, states = Polyline.through(path), motion.sample(EACH).position
     arc = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1)))
-    return float(max_distance(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5))
+    return max_distance(states, arc * line.length / max(arc[-1], 1e-12), line.states, line.arc, 1.5)
 
 
 def measure(figures: Figures, motion: Trajectory | None, path: np.ndarray, checker: Any, best: float | None) -> None:

@@ -10,7 +10,7 @@ import ruckig
 import toppra
 from toppra import algorithm, constraint
 
-from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds
+from apex_ompl.kernel.timing import max_path_speeds
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.curve import Curve, Polyline
@@ -85,8 +85,8 @@ def curve_of(path: np.ndarray) -> tuple[Curve, np.ndarray, np.ndarray]:
 def by_waypoints(path: np.ndarray) -> Trajectory | None:
     """Return the motion by Ruckig from waypoint to waypoint."""
     curve, first, second = curve_of(path)
-    step, x = curve.spacing / GRID_POINTS_PER_SPAN, np.empty(len(first))
-    max_path_speeds(first, second, LIMITS.velocity, LIMITS.acceleration, step, x)
+    step = curve.spacing / GRID_POINTS_PER_SPAN
+    x = max_path_speeds(first, second, LIMITS.velocity, LIMITS.acceleration, step)
     chosen = np.unique(np.linspace(0, len(x) - 1, max(2, math.ceil(step * len(x) / 0.2))).astype(int))
     points, still = curve.points(chosen * step), np.zeros(len(NAMES))
     states = [(q, 0.999 * first[k] * math.sqrt(x[k]), still) for q, k in zip(points, chosen, strict=True)]

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled import arrays
+from apex_ompl.kernel import arrays
 from apex_ompl.kernel.scene_builder import boxes_around
 from apex_ompl.types import Array, Flags
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.cloud_distance import primitive_distances
+from apex_ompl.kernel.geometry import primitive_distances
 from apex_ompl.problems.broad.shapes import BOX, CAPSULE, CYLINDER, Part, kernel_columns
 from apex_ompl.types import Array
 
@@ -17,10 +17,12 @@ HIDDEN = 1e-3  # depth in another part at which a triangle is left out of an ope
 
 def distances(parts: Sequence[Part], points: Array) -> Array:
     """Return the signed distances of points, shape (n, 3), to each part, shape (parts, n) [m]."""
-    found = np.empty((len(parts), len(points)))
-    for k, (kind, rotation, offset, size) in enumerate(zip(*kernel_columns(parts), strict=True)):
-        primitive_distances(np.ascontiguousarray((points - offset) @ rotation), int(kind), size, found[k])
-    return found
+    columns = zip(*kernel_columns(parts), strict=True)
+    rows = [
+        primitive_distances(np.ascontiguousarray((points - offset) @ rotation), int(kind), size)
+        for kind, rotation, offset, size in columns
+    ]
+    return np.array(rows).reshape(len(parts), len(points))
 
 
 def triangles(part: Part) -> tuple[Array, NDArray[np.int64]]:

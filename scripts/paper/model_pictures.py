@@ -18,7 +18,7 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.evaluation.metrics import diversity as mean_distance
 from apex_ompl.evaluation.summary import Table
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.arrays import BOX, HALF_SPACE, SPHERE
+from apex_ompl.kernel.arrays import BOX, HALF_SPACE, SPHERE
 from apex_ompl.model.guidance import EQUATION_7, Guidance
 from apex_ompl.model.proposals import Sampling
 from apex_ompl.ompl.setup import PlanningSetup, assemble

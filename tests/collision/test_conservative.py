@@ -13,7 +13,7 @@ from support import STEP, states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled.separation import COLLIDES
+from apex_ompl.kernel.compiled.check.separation import COLLIDES
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, MeshFile, Obstacle

@@ -13,7 +13,7 @@ from support import CUBE_OBJ, states_around_home
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.containment import Extent
-from apex_ompl.kernel.compiled.triangle_mesh import encloses
+from apex_ompl.kernel.compiled.geometry.triangles import encloses
 from apex_ompl.robot import Robot
 from apex_ompl.robot.geometry import link_of
 from apex_ompl.scene.bodies import AttachedObject, Obstacle

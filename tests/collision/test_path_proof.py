@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from support import benchmark_script, states_around_home
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.exact_shapes import ball_tree, mesh_of
+from apex_ompl.collision.exact_shapes import mesh_of
 from apex_ompl.collision.path_proof import TOLERANCE, Curve
+from apex_ompl.kernel.geometry import BallTree
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import Obstacle
@@ -199,7 +200,7 @@ def test_hands_at_their_limits_are_proved_as_whole_intervals() -> None:
 @given(st.integers(2, 200), st.integers(0, 2**32 - 1))
 def test_tree_of_balls_holds_its_triangles(count: int, seed: int) -> None:
     corners = np.random.default_rng(seed).normal(size=(count, 3, 3))
-    balls, halves, child, leaf = ball_tree(corners)
+    _, balls, halves, child, leaf = BallTree.over(corners)
     assert len(balls) == 2 * count - 1 and sorted(leaf[leaf >= 0]) == list(range(count))
     below: dict[int, list[int]] = {}
     for k in reversed(range(len(balls))):
@@ -213,12 +214,12 @@ def test_tree_of_balls_holds_its_triangles(count: int, seed: int) -> None:
 def test_convex_meshes_are_their_hulls(tmp_path: Path, grazing: ModuleType) -> None:
     grazing.write_tray(tmp_path / "tray.obj")
     tray = coal.MeshLoader().load(str(tmp_path / "tray.obj"), np.ones(3))
-    assert len(mesh_of(tray).corners) == tray.num_tris
+    assert len(mesh_of(tray).tree.corners) == tray.num_tris
     (tmp_path / "wedge.obj").write_text(
         "v 0 0 0\nv 0.3 0 0\nv 0 0.3 0\nv 0 0 0.3\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
     )
     wedge = coal.MeshLoader().load(str(tmp_path / "wedge.obj"), np.ones(3))
-    assert len(mesh_of(wedge).corners) == 0 and len(mesh_of(wedge).points) == 4
+    assert len(mesh_of(wedge).tree.corners) == 0 and len(mesh_of(wedge).points) == 4
 
 
 @settings(max_examples=30, deadline=None)

@@ -9,7 +9,7 @@ import torch
 from support import DATA
 
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, SPHERE
+from apex_ompl.kernel.arrays import BOX, CAPSULE, CYLINDER, SPHERE
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.model.config import (
     ConditionConfig,

@@ -6,7 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.kernel import robot_builder, robot_specs
-from apex_ompl.kernel.compiled.arrays import FIXED, PRISMATIC, REVOLUTE
+from apex_ompl.kernel.arrays import FIXED, PRISMATIC, REVOLUTE
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.tables import RobotTables
 

@@ -88,7 +88,7 @@ from apex_ompl.kernel import group_compilation
 from apex_ompl.kernel.compiled.entry_points import PLANS, Group
 from apex_ompl.kernel.compiled.jit import names_in_cache
 
-some = ("time_parameterization.sample_times", "motion_proof.lay_grid")
+some = ("timing.time_parameterization.sample_times", "check.motion_proof.lay_grid")
 parts = tuple({name: PLANS.functions[name]} for name in some)
 group = Group("two functions", 1, parts)
 group_compilation.CHILD = sys.argv[1] or group_compilation.CHILD

@@ -146,7 +146,7 @@ OUTSIDE = {
 def test_compiled_functions_take_nothing_from_outside_their_folder() -> None:
     """Copies with the same files share compiled code, so that nothing else may be compiled into it."""
     folder = Path(compilation.__file__).parent
-    for file in folder.glob("*.py"):
+    for file in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("apex_ompl"):
                 inside = node.module.startswith("apex_ompl.kernel.compiled")

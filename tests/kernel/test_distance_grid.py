@@ -16,8 +16,8 @@ from apex_ompl.collision.tabulate import primitives
 from apex_ompl.kernel import distance_grid
 from apex_ompl.kernel.compiled.arrays import GRID, SceneArrays, scene_view
 from apex_ompl.kernel.compiled.compilation import entry_point
+from apex_ompl.kernel.compiled.geometry.signed_distance import ball_apart, direction, distance
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.signed_distance import ball_apart, direction, distance
 from apex_ompl.kernel.distance_grid import (
     SLACK,
     DistanceGrid,

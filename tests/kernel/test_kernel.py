@@ -18,8 +18,8 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tabulate import primitives
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, robot_builder, robot_specs
-from apex_ompl.kernel.compiled import motion_proof, queries
 from apex_ompl.kernel.compiled.arrays import PRISMATIC
+from apex_ompl.kernel.compiled.check import motion_proof, queries
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.library import is_used
 from apex_ompl.kernel.scene_builder import scene_tables

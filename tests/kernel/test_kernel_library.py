@@ -19,9 +19,11 @@ import pytest
 from support import ROOT
 
 from apex_ompl.kernel import library
-from apex_ompl.kernel.compiled import cubic_pieces, dense_layer, motion_proof, time_parameterization
+from apex_ompl.kernel.compiled.check import motion_proof
 from apex_ompl.kernel.compiled.entry_points import ALL
 from apex_ompl.kernel.compiled.jit import CompiledFunction
+from apex_ompl.kernel.compiled.network import dense_layer
+from apex_ompl.kernel.compiled.timing import cubic_pieces, time_parameterization
 
 MACHINES = sorted(file.stem.removeprefix("kernel-") for file in library.FOLDER.glob("*.json"))
 IS_BUILT_HERE = pytest.mark.skipif(not library.is_used(), reason=library.why_not_used())
@@ -61,10 +63,11 @@ def test_all_functions_that_python_calls_are_listed_with_types_that_fit_their_an
         "bool": "b1",
     }
     found = {}
-    for path in library.SOURCES.glob("*.py"):
+    for path in library.SOURCES.rglob("*.py"):
+        module = ".".join(path.relative_to(library.SOURCES).with_suffix("").parts)
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef) and any("entry_point" in ast.unparse(d) for d in node.decorator_list):
-                found[f"{path.stem}.{node.name}"] = [ast.unparse(a.annotation) for a in node.args.args if a.annotation]
+                found[f"{module}.{node.name}"] = [ast.unparse(a.annotation) for a in node.args.args if a.annotation]
     assert found.keys() == ALL.keys()
     for name, hints in found.items():
         text = ALL[name][0].replace("Tuple((f8, f8, f8, f8, f8, f8, i8))", "Numbers").replace("[:, ", "[")
@@ -124,7 +127,7 @@ def both(function: Any) -> tuple[Any, Any]:
 
 def compiled(function: Any) -> Any:
     """Let numba compile what a function of the library was built from."""
-    module, name = function.__name__.split(".")
+    module, _, name = function.__name__.rpartition(".")
     source = sys.modules[f"{library.PACKAGE}.{module}"].__file__
     assert source is not None
     space: dict[str, Any] = {"__name__": f"copy_of_{module}"}
@@ -186,7 +189,7 @@ def flip(file: Path) -> None:
 
 
 def edit(file: Path) -> None:
-    source = file.parents[1] / "compiled" / "motion_proof.py"
+    source = file.parents[1] / "compiled" / "check" / "motion_proof.py"
     source.write_text(source.read_text() + "\n# edited\n")
 
 
@@ -200,7 +203,7 @@ FAULTS = {
 SMALL = """
 import numpy as np
 from apex_ompl.kernel.library import why_not_used
-from apex_ompl.kernel.compiled.motion_proof import lay_grid
+from apex_ompl.kernel.compiled.check.motion_proof import lay_grid
 print(lay_grid(np.ones((2, 3)), 0.1, np.zeros(1, np.int64)), why_not_used())
 """
 

@@ -38,7 +38,7 @@ for name in ("pinocchio", "coal", "ompl"):
     sys.modules[name] = None
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
-from apex_ompl.kernel.compiled.arrays import BOX
+from apex_ompl.kernel.arrays import BOX
 from apex_ompl.kernel.tables import RobotTables
 at = np.eye(4)
 at[:3, 3] = {list(post.position)}

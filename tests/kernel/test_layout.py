@@ -13,7 +13,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.compiled.arrays import robot_view, scene_view
 from apex_ompl.kernel.compiled.jit import uncached
 from apex_ompl.kernel.compiled.layout import new_buffers, unpack
-from apex_ompl.kernel.compiled.path_cost import Buffers, buffers_view
+from apex_ompl.kernel.compiled.path.path_cost import Buffers, buffers_view
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 

@@ -13,9 +13,13 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.compiled.arrays import robot_view
 from apex_ompl.kernel.compiled.compilation import outlined
 from apex_ompl.kernel.compiled.jit import uncached
-from apex_ompl.kernel.compiled.kinematics import place_joints, place_robot
 from apex_ompl.kernel.compiled.layout import new_buffers
-from apex_ompl.kernel.compiled.motion_bound import bound_displacements, cluster_displacement, relative_displacement
+from apex_ompl.kernel.compiled.robot.kinematics import place_joints, place_robot
+from apex_ompl.kernel.compiled.robot.motion_bound import (
+    bound_displacements,
+    cluster_displacement,
+    relative_displacement,
+)
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_dimensions, workspace_view
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot

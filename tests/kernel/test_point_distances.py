@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled.arrays import HALF_SPACE
-from apex_ompl.kernel.point_distances import group_clearances, nearest_points
+from apex_ompl.kernel.arrays import HALF_SPACE
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
+from apex_ompl.kernel.scene_distances import group_clearances, nearest_points
 from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.geometry import signed_distances
 from apex_ompl.types import Array

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from apex_ompl.kernel.compiled.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
+from apex_ompl.kernel.arrays import BOX, CAPSULE, CYLINDER, HALF_SPACE, SPHERE
 from apex_ompl.kernel.scene_builder import LEAF, Primitive, Solids, moved, scene_tables, tables_of
 from apex_ompl.kernel.tables import SceneTables
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
-from apex_ompl.kernel.shortcuts import shortcut
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair, shortcut
 from apex_ompl.paths.path import path_length
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.types import Array

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from apex_ompl.kernel.compiled.jit import uncached
-from apex_ompl.kernel.compiled.sincos import MOST, TOGETHER, set_sines
+from apex_ompl.kernel.compiled.packet.sincos import MOST, TOGETHER, set_sines
 
 
 @uncached

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
-from apex_ompl.kernel import trees
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel import search
+from apex_ompl.kernel.search import TreePair
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
@@ -87,8 +87,8 @@ def test_guides_show_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
         while part is None:
             part = pieces.grow(PIECE)
         assert whole is not None and np.array_equal(whole, part)
-    monkeypatch.setattr(trees, "GUIDED", 1.0)
-    monkeypatch.setattr(trees, "GUIDE_SPREAD", 0.0)
+    monkeypatch.setattr(search, "GUIDED", 1.0)
+    monkeypatch.setattr(search, "GUIDE_SPREAD", 0.0)
     only = pair(0)
     only.guide(guides[5:7])
     states = only._random_states(200)
@@ -97,7 +97,7 @@ def test_guides_show_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_trees_that_are_full_get_more_room(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trees, "ROOM", 4)
+    monkeypatch.setattr(search, "ROOM", 4)
     checker, pair, path = grown("cage/hard/800001", 0)
     assert path is not None and pair.size > 64
     assert checker.are_free(sample_path(path, RESOLUTION)[0]).all()

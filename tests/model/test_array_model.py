@@ -28,7 +28,7 @@ from models import (
 )
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.compiled.dense_layer import dense_layer
+from apex_ompl.kernel.compiled.network.dense_layer import dense_layer
 from apex_ompl.model.array_model import ArrayModel, expanded, is_supported, quantized, weight_shapes
 from apex_ompl.model.checkpoint import load_model
 from apex_ompl.model.config import ConditionConfig, DenoiserConfig, LatentConfig, NoiseConfig

@@ -20,8 +20,8 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances
 from apex_ompl.kernel import Primitive, scene_tables
-from apex_ompl.kernel.compiled.arrays import BOX, CYLINDER, GRID, HALF_SPACE, SPHERE
-from apex_ompl.kernel.compiled.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
+from apex_ompl.kernel.arrays import BOX, CYLINDER, GRID, HALF_SPACE, SPHERE
+from apex_ompl.kernel.compiled.geometry.grid_regions import OCCUPIED, OUTSIDE, add_up, best_box, label_regions
 from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
 from apex_ompl.kernel.scene_builder import primitive
 from apex_ompl.model.primitive_fit import FittedShapes, fitted_shapes, scene_of_primitives

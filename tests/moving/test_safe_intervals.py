@@ -8,7 +8,7 @@ from crossings import arm_motion, crossing, crossing_obstacle
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.compiled.blocked_intervals import MOST_SPANS
+from apex_ompl.kernel.compiled.moving.blocked_intervals import MOST_SPANS
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.retime import Blocked, blocked
 from apex_ompl.robot import Robot

@@ -7,8 +7,7 @@ import pytest
 from scipy.optimize import linprog
 from support import distance
 
-from apex_ompl.kernel.compiled.polyline_distance import max_distance
-from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
+from apex_ompl.kernel.compiled.timing.time_parameterization import max_distance, max_path_speeds, sample_times
 from apex_ompl.timing.curve import Curve, Polyline
 
 VELOCITY, ACCELERATION = np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0])

@@ -12,7 +12,7 @@ from support import distance
 from timings import LIMITS, NAMES, RATE, keeps_limits, paths, timed
 
 from apex_ompl.errors import ParameterError, TimingError, UnknownNameError
-from apex_ompl.kernel.compiled.time_parameterization import max_path_speeds, sample_times
+from apex_ompl.kernel.compiled.timing.time_parameterization import max_path_speeds, sample_times
 from apex_ompl.robot import Limits
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.curve import Curve, Polyline

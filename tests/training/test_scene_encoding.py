@@ -20,7 +20,7 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.point_distances import nearest_points
+from apex_ompl.kernel.scene_distances import nearest_points
 from apex_ompl.model.array_model import ArrayModel
 from apex_ompl.model.config import PIECES
 from apex_ompl.model.query import MAX_DISTANCE, ObstacleSet, Probes

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from models import DOF, HANDS, POST, REFINED, WALL, kernel, keys, network, query, some_paths
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.point_distances import nearest_points
+from apex_ompl.kernel.scene_distances import nearest_points
 from apex_ompl.model.query import ObstacleSet, Probes
 from apex_ompl.model.scene_encoding import REACH, SceneEncoding
 from apex_ompl.training.conditions import Augmentation, EncodedPaths

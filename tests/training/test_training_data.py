@@ -13,7 +13,7 @@ from trainings import HERE, config, query_from_path
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.compiled.arrays import BOX
+from apex_ompl.kernel.arrays import BOX
 from apex_ompl.kernel.scene_builder import Primitive, scene_tables
 from apex_ompl.training.data import Mirror, is_held_out, shard_paths, split
 from apex_ompl.training.records import Paths

@@ -1,8 +1,31 @@
-"""The one way down: no module imports from a layer above its own."""
+"""Packages of `apex_ompl` import downwards only, and nobody outside `kernel` imports `kernel.compiled`.
+
+From the top, as CONTRIBUTING has it:
+
+1. `cli` parses commands; `evaluation` runs OMPL's Benchmark and reports; `viz` draws: renderings, plots, the viewer.
+2. `api`: `load_problem`, `setup`, `plan`; `loop`: the closed loop, its sensor, executor and clocks; `loop.replan`:
+   replanners.
+3. `planning`: `MotionPlanner`, `World`, the steps of a plan; `result`: what a plan returns.
+4. `planners/`, `problems/` (at the top of the tree): planners by name with their parameters; suites, worlds, frozen
+   problems.
+5. `baselines`: the rivals gpmp, damon, drrt, imitation and control; `training`: torch networks, data sets, their
+   generation.
+6. `apex`: the planner APEX, its parameters, the stages of `solve`, their context and report.
+7. `moving`: dynamic obstacles in time and what replanners share; `ompl`: state space, validity checkers, set-up for
+   OMPL.
+8. `goals`: alignments, poses, grasps, inverse kinematics; `timing`: motions over time; `model`: inference without
+   torch.
+9. `collision`: the checker, spheres before meshes; `paths`: splines, the optimizer; `robot`: Pinocchio models, MoveIt's
+   files.
+10. `kernel`: wrappers of compiled code over flat arrays; `scene`: problem files and bodies; `util`, `types`, `errors`.
+    `planners/` and `problems/` stand at the top because that is where users of OMPL look for them; `apex_ompl/planners`
+    and `apex_ompl/problems` are links to them, so that both import as parts of the package.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -84,3 +107,31 @@ def test_low_packages_know_no_ompl() -> None:
     for path in FILES:
         if HEIGHT[package(path)] < HEIGHT["ompl"]:
             assert "ompl" not in outside(path), path
+
+
+def modules(path: Path) -> set[str]:
+    """Modules that a file imports, at the top or inside functions, by their full names."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+    return found
+
+
+def test_nobody_outside_the_kernel_imports_compiled_code() -> None:
+    """The wrappers in ``apex_ompl/kernel`` are the one hatch; the script that builds the library is beside it."""
+    others = [
+        path for folder in ("planners", "problems", "examples", "scripts") for path in (ROOT / folder).rglob("*.py")
+    ]
+    users = [path for path in FILES if package(path) != "kernel"] + [p for p in others if p.name != "build_kernel.py"]
+    for path in users:
+        inside = {name for name in modules(path) if f"{name}.".startswith("apex_ompl.kernel.compiled.")}
+        assert not inside, f"{path.relative_to(ROOT)} imports {min(inside)}"
+
+
+def test_contributing_has_the_same_ten_lines() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text().partition("## The house in ten lines")[2].partition("\n## ")[0]
+    mine, theirs = (re.findall(r"^(\d+\. .*?)(?=^\d+\. |\Z)", some, re.M | re.S) for some in (__doc__ or "", text))
+    assert [one.split() for one in mine] == [one.split() for one in theirs] and len(mine) == 10

@@ -9,7 +9,7 @@ from ompl import base as ob
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.trees import OMPL_SHARE, compiled_trees, grow, ompl_trees
-from apex_ompl.kernel.shortcuts import ENOUGH, RESOLUTION, shortcut
+from apex_ompl.kernel.search import ENOUGH, RESOLUTION, shortcut
 from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.paths.path import Path, path_length

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from apex_ompl.baselines.drrt.dynamic_rrt import AreFree
-from apex_ompl.kernel.compiled.graph_search import shortest_path
+from apex_ompl.kernel import search
 from apex_ompl.types import Array, Flags, Indices
 
 Motion = tuple[str, int, int]
@@ -99,12 +99,11 @@ class LazySearch:
         self._free: set[Motion] = set()
         self._blocked: set[Motion] = set()
         self._hit = np.zeros(len(graph.states), bool)
-        count, edges = len(graph.states), len(graph.ends)
+        count = len(graph.states)
         self._entry, self._leave = np.full((len(starts), count), np.inf), np.full((len(goals), count), np.inf)
         away = [np.linalg.norm(graph.states - goal, axis=1) for goal in goals]
         self._heuristic = np.min(away, axis=0)
-        room = count + edges
-        self._buffers = np.empty(count), np.empty(count, np.int64), np.empty(room), np.empty(room, np.int64)
+        self._shortest = search.GraphSearch(search.Graph(graph.first_edges, graph.ends, graph.lengths))
 
     def connect(self, start: int | None = None, goal: int | None = None, *, nodes: Indices) -> None:
         """Let the path enter the graph from a start, or leave it for a goal, given by number, over some nodes.
@@ -142,7 +141,7 @@ class LazySearch:
         """
         while not stop():
             found = self._search()
-            searched(int(np.isfinite(self._buffers[0]).sum()))
+            searched(int(np.isfinite(self._shortest.cost).sum()))
             if found is None:
                 if not self.more():
                     return None
@@ -155,11 +154,10 @@ class LazySearch:
     def _search(self) -> _Found | None:
         """Return the shortest path, or None."""
         self.searches += 1
-        graph, (cost, parent, keys, heap) = self.graph, self._buffers
-        node = int(shortest_path(
-            graph.first_edges, graph.ends, graph.lengths, self._usable, self._entry.min(axis=0),
-            self._leave.min(axis=0), self._heuristic, cost, parent, keys, heap,
-        ))  # fmt: skip
+        graph, parent = self.graph, self._shortest.parent
+        node = self._shortest.last_node(
+            self._usable, self._entry.min(axis=0), self._leave.min(axis=0), self._heuristic
+        )  # fmt: skip
         if node < 0:
             return None
         goal, nodes, edges = int(np.argmin(self._leave[:, node])), [node], list[int]()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from apex_ompl.kernel.compiled.triangle_mesh import CORNERS, column_boxes
+from apex_ompl.kernel.geometry import column_boxes
 from apex_ompl.scene.meshes import is_watertight
 from apex_ompl.types import Array
 
@@ -28,10 +28,8 @@ def bounding_boxes(corners: Array, columns: int = 8) -> Array:
     if not is_watertight(corners):
         columns = 1
     low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
-    boxes = np.full((3, columns, columns, 2, 3), np.inf)
-    boxes[..., 1, :] = -np.inf
     width = np.maximum((high - low) / columns, 1e-12)
-    column_boxes(np.ascontiguousarray(corners), low, width, COLUMN_PAD, np.empty((2, CORNERS, 3)), boxes)
+    boxes = column_boxes(corners, low, width, COLUMN_PAD, columns)
     found = [along[np.isfinite(along).all(axis=(2, 3))] for along in boxes]
     least = min(found, key=lambda some: float(np.prod(some[:, 1] - some[:, 0], axis=1).sum()))
     wide: Array = least + np.array([-BOX_PAD, BOX_PAD])[:, None]

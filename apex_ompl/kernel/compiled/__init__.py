@@ -1,1 +1,5 @@
-"""All that numba compiles; the cache of compiled code is named after a digest of the files in this folder."""
+"""The functions that numba compiles, by subject.
+
+The cache of compiled code is named after a digest of all files in this folder. Only :mod:`apex_ompl.kernel` imports
+from here: its modules wrap the functions for the other packages.
+"""

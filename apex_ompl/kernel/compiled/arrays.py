@@ -1,4 +1,4 @@
-"""Robot and scene as flat arrays: all that compiled code knows of them, without Pinocchio.
+"""Robot and scene as flat arrays, the only form in which compiled code knows them; without Pinocchio.
 
 A robot is a tree of joints. Bodies are fixed to joints and covered by trees of spheres (:mod:`apex_ompl.collision`
 makes them and proves that they contain the solids). Bodies that move together, or nearly so (a hand with its fingers),
@@ -15,7 +15,7 @@ FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 BOX, SPHERE, CYLINDER, CAPSULE, HALF_SPACE = range(5)
 GRID_ROW = 8  # numbers of a grid's row
 GRID = 6  # of distances; 5 is a hull, among the exact shapes
-RUN = 8  # pairs that are looked at together
+RUN = 8  # pairs that are examined together
 BINS = 16  # ranges of values of a joint that drives inner ones which have balls of their own
 LIMIT_SLACK = 1e-9  # by which clusters' balls hold beyond the limits: motions are bounded with rounding [rad]
 
@@ -45,8 +45,8 @@ class RobotArrays(NamedTuple):
     number of ranges per unit, or 0. ``part_lazy`` are the inner joints of a part, ``part_bodies`` its bodies.
 
     A node is a sphere (``node_center`` in the frame of its body's joint, ``node_radius``) around the part of the solid
-    that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` says which of
-    ``inner_ball`` are inside of a body's solid, in the frame of its joint.
+    that the leaves below cover; ``node_outer`` is a radius around the leaves themselves. ``body_inner`` are the first
+    and number of those of ``inner_ball`` that are inside of a body's solid, in the frame of its joint.
 
     ``pair_ball`` holds, for both clusters of a pair, what ``cluster_ball`` does, around the bodies alone that the pair
     is about, ``pair_outer`` the radius around their leaf spheres: fingers are checked against a wrist, the palm, which
@@ -105,11 +105,11 @@ class SceneArrays(NamedTuple):
 
     ``kind`` is one of BOX ... HALF_SPACE or GRID, ``owner`` the number of the obstacle that a solid is part of.
     ``size`` holds half edges, or radius and half length; a half-space has its unit normal in ``offset`` and its
-    distance in ``size``. ``exact`` says whether it is the shape of that part and not only contains it. A grid has its
+    distance in ``size``. ``exact`` is 1 where it is the shape of that part, 0 where it only contains it. A grid has its
     first node at ``offset``, and in ``size`` its spacing, by how much its values were lowered, and the radius of the
     balls around points. ``grid`` says which of ``values`` are its own: the first, and how many along each axis; then
-    where the tree over its points or triangles begins, its levels, and the number of these and of the numbers of each,
-    see :mod:`apex_ompl.kernel.compiled.item_tree`.
+    where the tree over its points or triangles starts, its levels, and the number of these and of the numbers of each,
+    see :mod:`apex_ompl.kernel.compiled.geometry.bounding_trees`.
     Nodes of the tree are in depth-first order: ``tree_skip`` is the next node outside of a node's subtree,
     ``tree_range`` first obstacle and number of them (0 for inner nodes). The last ``open`` (1,) obstacles are
     half-spaces, which no box holds. ``allowed`` are pairs of a body and an owner that may touch.

@@ -16,10 +16,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Deferred:
-    """What numba knows as a function, made when numba asks for it."""
+    """A function of numba's that is made when numba asks for it."""
 
     def __init__(self, make: Callable[[], Any]) -> None:
-        """Take what makes it."""
+        """Defer ``make``, which returns numba's function."""
         self._make = make
 
     @cached_property

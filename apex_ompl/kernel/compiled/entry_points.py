@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 ROBOT = "i8[::1], f8[::1], "
 WORKSPACE = BUFFERS = ROBOT
-SCENE = MOVERS = ROBOT + "f4[::1], "
+SCENE = DYNAMIC = ROBOT + "f4[::1], "
 TREES = "f8[:, ::1], f8, f8, f8[:, :, ::1], i8[:, ::1], i8[::1], i8[::1], f8[::1], f8[::1], "
 PROOF = "f8[:, ::1], i8[::1], i8[:, ::1], i8[::1], f8[::1], i8[:, ::1], i8[::1]"
 CURVE = "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, i8"
@@ -18,7 +18,7 @@ KNOTS = "f8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1]"
 SETTINGS = "Tuple((f8, f8, f8, f8, f8, f8, i8))"
 
 Functions = Mapping[str, tuple[str, int]]
-"""Functions: module and name -> types of the arguments, and typical time to compile [s]."""
+"""Functions: name below this package -> types of the arguments, and typical time to compile [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,17 +55,17 @@ PLANS = Group(
     40,
     (
         {
-            "motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 10),
-            "tree_search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 4),
-            "shortcutting.shortcut_path": (
+            "check.motion_proof.prove_path": (ROBOT + SCENE + WORKSPACE + PROOF, 10),
+            "path.search.grow_trees": (ROBOT + SCENE + WORKSPACE + TREES + PROOF, 4),
+            "path.shortcutting.shortcut_path": (
                 ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], i8[::1], " + PROOF,
                 4,
             ),
         },
         {
-            "queries.check_states": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], i8[:, :, ::1], i8[::1]", 2),
-            "queries.clearances": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], f8[:, :, ::1]", 6),
-            "path_optimization.optimize_path": (
+            "check.queries.check_states": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], i8[:, :, ::1], i8[::1]", 2),
+            "check.queries.clearances": (ROBOT + SCENE + WORKSPACE + "f8[:, ::1], f8, f8[:, ::1], f8[:, :, ::1]", 6),
+            "path.path_optimization.optimize_path": (
                 ROBOT
                 + SCENE
                 + WORKSPACE
@@ -74,60 +74,63 @@ PLANS = Group(
             ),
         },
         {
-            "curve_proof.prove_curve": (ROBOT + SCENE + ROBOT + "i8[::1], " + 3 * ROBOT + CURVE, 18),
+            "check.curve_proof.prove_curve": (ROBOT + SCENE + ROBOT + "i8[::1], " + 3 * ROBOT + CURVE, 18),
         },
         {
-            "queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
-            "ball_tree.median_order": ("f8[:, ::1], i8[::1], i8[:, ::1]", 1),
-            "ball_tree.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1]", 1),
-            "farthest_points.farthest_points": ("f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8, i8[::1]", 1),
-            "motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
-            "jerk_profiles.join_profiles": (
+            "check.queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),
+            "geometry.bounding_trees.median_order": ("f8[:, ::1], i8[::1], i8[:, ::1]", 1),
+            "geometry.bounding_trees.node_balls": ("f8[:, :, ::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1]", 1),
+            "geometry.convex_distance.farthest_points": ("f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8, i8[::1]", 1),
+            "check.motion_proof.lay_grid": ("f8[:, ::1], f8, i8[::1]", 1),
+            "timing.jerk_profiles.join_profiles": (
                 "f8[:, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[:, :, ::1], f8[:, :, :, ::1], i8[::1], "
                 "f8[::1], f8[:, :, ::1]",
                 2,
             ),
-            "cubic_pieces.sample_motion": (KNOTS + ", f8[::1], i8, f8[:, :, ::1]", 1),
-            "cubic_pieces.motion_extremes": (KNOTS + ", f8[:, ::1]", 1),
-            "cubic_pieces.relative_gap": (KNOTS, 1),
-            "cubic_pieces.cubic_rates": (KNOTS + ", f8[:, ::1]", 1),
-            "polyline_distance.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
-            "time_parameterization.max_path_speeds": ("f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]", 1),
-            "time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
-            "point_distance.nearest_points": (SCENE + "i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1]", 2),
-            "ball_groups.group_clearances": (
+            "timing.cubic_pieces.sample_motion": (KNOTS + ", f8[::1], i8, f8[:, :, ::1]", 1),
+            "timing.cubic_pieces.motion_extremes": (KNOTS + ", f8[:, ::1]", 1),
+            "timing.cubic_pieces.relative_gap": (KNOTS, 1),
+            "timing.cubic_pieces.cubic_rates": (KNOTS + ", f8[:, ::1]", 1),
+            "timing.time_parameterization.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
+            "timing.time_parameterization.max_path_speeds": (
+                "f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]",
+                1,
+            ),
+            "timing.time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),
+            "geometry.scene_distance.nearest_points": (SCENE + "i8[::1], f8[:, ::1], f8, f8[::1], f8[:, ::1]", 2),
+            "geometry.scene_distance.group_clearances": (
                 SCENE + "i8[::1], f8[:, :, ::1], f8[:, :, :, ::1], f8, f8[:, ::1], f8[::1]",
                 2,
             ),
-            "joint_push.joint_pushes": (
+            "robot.kinematics.joint_pushes": (
                 ROBOT
                 + "f8[:, :, :, ::1], f8[:, :, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8[:, ::1]",
                 1,
             ),
-            "triangle_distance.surface_distances": (
+            "geometry.triangles.surface_distances": (
                 "f8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], i8[::1], i8[::1], f8, f8[::1]",
                 1,
             ),
-            "cloud_distance.primitive_distances": ("f8[:, ::1], i8, f8[::1], f8[::1]", 1),
-            "triangle_mesh.encloses": ("f8[:, :, ::1], f8[:, ::1], b1, f8, f8, f8", 1),
-            "matrix_products.matrix_products": ("f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]", 1),
-            "matrix_products.factorize": ("f8[:, ::1], f8[:, ::1]", 1),
-            "matrix_products.solve_factored": ("f8[:, ::1], f8[:, ::1]", 1),
-            "dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
+            "geometry.cloud_distance.primitive_distances": ("f8[:, ::1], i8, f8[::1], f8[::1]", 1),
+            "geometry.triangles.encloses": ("f8[:, :, ::1], f8[:, ::1], b1, f8, f8, f8", 1),
+            "packet.matrix_products.matrix_products": ("f8[:, :, ::1], f8[:, :, ::1], f8[:, :, ::1]", 1),
+            "packet.matrix_products.factorize": ("f8[:, ::1], f8[:, ::1]", 1),
+            "packet.matrix_products.solve_factored": ("f8[:, ::1], f8[:, ::1]", 1),
+            "network.dense_layer.dense_layer": ("i1[:, ::1], f4[::1], f4[::1], f4[:, ::1], f4[:, ::1]", 1),
         },
     ),
 )
 """What every plan needs."""
 
 RUNS = Group(
-    "what runs among moving obstacles need",
+    "what runs among dynamic obstacles need",
     25,
     (
         {
-            "motion_optimization.optimize_motion": (
+            "moving.motion_optimization.optimize_motion": (
                 ROBOT
                 + SCENE
-                + MOVERS
+                + DYNAMIC
                 + WORKSPACE
                 + f"f8[:, ::1], f8[:, ::1], i8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8, i8, f8[:, ::1], {SETTINGS}, "
                 "i8[::1], f8[::1], f8[::1]",
@@ -135,13 +138,13 @@ RUNS = Group(
             ),
         },
         {
-            "dynamic_obstacles.clearances_in_time": (
-                ROBOT + MOVERS + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
+            "moving.dynamic_obstacles.clearances_in_time": (
+                ROBOT + DYNAMIC + WORKSPACE + "f8[:, ::1], f8[::1], f8, f8[:, ::1], f8[::1], f8[:, ::1]",
                 2,
             ),
-            "dynamic_obstacles.first_conflict": (
+            "moving.dynamic_obstacles.first_conflict": (
                 ROBOT
-                + MOVERS
+                + DYNAMIC
                 + WORKSPACE
                 + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8, f8, f8, f8, f8[:, ::1], f8[::1], "
                 "i8[::1]",
@@ -149,14 +152,14 @@ RUNS = Group(
             ),
         },
         {
-            "blocked_intervals.blocked_intervals": (
-                ROBOT + MOVERS + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8, f8, f8[::1], "
+            "moving.blocked_intervals.blocked_intervals": (
+                ROBOT + DYNAMIC + WORKSPACE + "f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[:, ::1], f8, f8, f8[::1], "
                 "f8[:, :, ::1], i8[::1]",
                 14,
             ),
-            "stops_among_dynamic_obstacles.first_unproved_stop": (
+            "moving.stop_proof.first_unproved_stop": (
                 ROBOT
-                + MOVERS
+                + DYNAMIC
                 + WORKSPACE
                 + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1], f8[:, ::1], f8[:, ::1], f8, "
                 "f8[:, :, ::1], " + 5 * "f8[::1], " + "f8, f8[::1], i8[::1], f8, f8, f8, f8[:, ::1], f8[::1], i8[::1], "
@@ -166,111 +169,111 @@ RUNS = Group(
             ),
         },
         {
-            "speed_search.earliest_arrivals": (
+            "moving.speed_search.earliest_arrivals": (
                 "f8[:, :, ::1], i8[::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[::1], f8, i8, b1, i8, f8, "
                 "f8, f8, f8[:, :, :, ::1], i8[:, ::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f8[::1], i8[::1], "
                 "f8[:, ::1]",
                 4,
             ),
-            "speed_profile.push_bounds": (
+            "moving.speed_profile.push_bounds": (
                 "f8[:, :, ::1], f8[::1], f8[::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1]",
                 1,
             ),
-            "speed_profile.profile_places": ("f8[::1], f8, f8, i8[::1], f8[:, ::1], f8, f8, f8[::1]", 1),
-            "speed_profile.follow_profile": (
+            "moving.speed_profile.profile_places": ("f8[::1], f8, f8, i8[::1], f8[:, ::1], f8, f8, f8[::1]", 1),
+            "moving.speed_profile.follow_profile": (
                 "f8[::1], f8[:, :, ::1], f8, f8[::1], f8, "
                 + 5 * "f8[::1], "
                 + "f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], "
                 "f8[:, :, ::1]",
                 3,
             ),
-            "speed_profile.first_blocked": (
+            "moving.speed_profile.first_blocked": (
                 "f8[:, ::1], f8[:, :, ::1], i8[::1], f8[::1], f8[:, :, ::1], i8[::1], f8[::1], f8, f8",
                 1,
             ),
-            "path_stop.stop_on_path": (
+            "moving.stops.stop_on_path": (
                 "f8[::1], f8[:, :, ::1], f8, f8[:, ::1], "
                 + 5 * "f8[::1], "
                 + "f8, f8[:, ::1], f8[::1], f8[::1], f8[::1], "
                 "f8[:, :, ::1]",
                 4,
             ),
-            "stop_profiles.stop_joints": (
+            "moving.stops.stop_joints": (
                 7 * "f8[::1], " + "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, :, ::1], f8[::1]",
                 3,
             ),
         },
     ),
 )
-"""What a run of the closed loop needs besides."""
+"""What a run of the closed loop needs in addition."""
 
 OTHERS: Functions = {
-    "cloud_distance.near_mesh": (
+    "geometry.cloud_distance.near_mesh": (
         "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], "
         "i8[::1], f8[:, ::1], f8, i8[:, ::1]",
         3,
     ),
-    "cloud_distance.any_inside": (
+    "geometry.cloud_distance.any_inside": (
         "f8[:, :, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], b1, f8[:, ::1], f8[::1], "
         "f8[:, ::1], i8[:, ::1]",
         2,
     ),
-    "cloud_distance.near_primitive": (
+    "geometry.cloud_distance.near_primitive": (
         "f8[:, :, ::1], f8[:, ::1], i8[::1], i8[::1], i8, f8[::1], f8[:, ::1], f8, i8[:, ::1]",
         2,
     ),
-    "graph_search.shortest_path": (
+    "path.search.shortest_path": (
         "i8[::1], i8[::1], f8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i8[::1], f8[::1], i8[::1]",
         1,
     ),
-    "grid_regions.label_regions": ("i8[:, :, ::1], i8[::1]", 1),
-    "grid_regions.add_up": ("i8[:, :, ::1], i8[:, :, ::1]", 1),
-    "grid_regions.best_box": ("i8[:, :, ::1], i8[:, :, ::1], i8[:, ::1], f8, i8[:, ::1], i8[:, ::1]", 2),
-    "grid_tabulation.tabulate_points": (
+    "geometry.grid_regions.label_regions": ("i8[:, :, ::1], i8[::1]", 1),
+    "geometry.grid_regions.add_up": ("i8[:, :, ::1], i8[:, :, ::1]", 1),
+    "geometry.grid_regions.best_box": ("i8[:, :, ::1], i8[:, :, ::1], i8[:, ::1], f8, i8[:, ::1], i8[:, ::1]", 2),
+    "geometry.grid_building.tabulate_points": (
         "f8[:, ::1], f8, f8, f8, f8, f4[:, :, ::1], f4[:, :, ::1], f8[::1], i8[::1], f8[::1]",
         2,
     ),
-    "grid_tabulation.tabulate_triangles": (
+    "geometry.grid_building.tabulate_triangles": (
         "f8[:, :, ::1], b1, f8, f8, f8, f8, f8, f4[:, :, ::1], f4[:, :, ::1], f8[::1], i8[::1], f8[::1]",
         3,
     ),
-    "ik_solver.descend": (
+    "robot.inverse_kinematics.descend": (
         ROBOT
         + WORKSPACE
         + "i8[::1], i8[::1], i8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], f8, i8, f8, i8[::1], f8[::1]",
         4,
     ),
-    "ik_solver.residual_and_jacobian": (
+    "robot.inverse_kinematics.residual_and_jacobian": (
         ROBOT + WORKSPACE + "i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[::1]",
         2,
     ),
-    "item_tree.order_items": ("f8[:, :, ::1], f8[::1], f8, i8[:, ::1], i8[::1], f4[:, ::1]", 1),
-    "item_tree.fill_boxes": ("f4[:, ::1], i8, f4[:, ::1]", 1),
-    "obstacle_batches.nearest_of_scenes": (
+    "geometry.bounding_trees.order_items": ("f8[:, :, ::1], f8[::1], f8, i8[:, ::1], i8[::1], f4[:, ::1]", 1),
+    "geometry.bounding_trees.fill_boxes": ("f4[:, ::1], i8, f4[:, ::1]", 1),
+    "geometry.scene_distance.nearest_of_scenes": (
         SCENE + "i8[::1], f8[:, :, ::1], f8, f8[:, ::1], f8[:, :, ::1]",
         1,
     ),
-    "obstacle_batches.least_distances": (SCENE + "i8[::1], f8[:, :, ::1], f8[::1], f8[::1]", 1),
-    "obstacle_batches.clearances_alone": (
+    "geometry.scene_distance.least_distances": (SCENE + "i8[::1], f8[:, :, ::1], f8[::1], f8[::1]", 1),
+    "geometry.scene_distance.clearances_alone": (
         SCENE + "f8[:, :, ::1], f8[:, :, :, ::1], f8, f8[:, ::1], f8[:, ::1]",
         1,
     ),
-    "path_cost.path_cost": (
+    "path.path_cost.path_cost": (
         ROBOT
         + SCENE
         + WORKSPACE
         + f"f8[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], {SETTINGS}, i8[::1], f8[::1], f8[::1]",
         5,
     ),
-    "state_costs.state_costs": (
+    "moving.state_costs.state_costs": (
         ROBOT
         + SCENE
-        + MOVERS
+        + DYNAMIC
         + WORKSPACE
         + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]",
         6,
     ),
-    "triangle_mesh.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
+    "geometry.triangles.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }
 """What point clouds, grids, inverse kinematics, roadmaps and trainings call; without the library, compiled at need."""
 

@@ -49,7 +49,7 @@ LOG = logging.getLogger("apex_ompl")
 OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False, "no_cfunc_wrapper": True}
 
 # Functions that only compiled ones call need no code that unpacks Python's arguments, which takes long to compile. What
-# is not said here numba takes from the function that is being compiled when it comes to this one.
+# is not set here numba takes from the function that is being compiled when it comes to this one.
 INNER: dict[str, Any] = {**OPTIONS, "no_cpython_wrapper": True, "pipeline_class": InnerCompiler, "fastmath": False}
 REASSOCIATING = {"reassoc", "contract"}
 
@@ -74,7 +74,7 @@ def _has_level() -> bool:
 @cache
 def _digest() -> str:
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     processor = f"{platform.machine()} {LEVEL if _has_level() else llvm.get_host_cpu_name()}"
     digest.update(f"{sys.version_info[:3]} {sys.flags.optimize} {numba.__version__} {processor}".encode())
@@ -105,7 +105,7 @@ def whereabouts() -> str:
 
 
 def names_in_cache() -> set[str]:
-    """Return the names of the functions of which there is code in the cache."""
+    """Return the names of the functions whose code is in the cache."""
     folder = cache_folder()
     code = folder.rglob("*.nbc") if folder else ()
     return {path.name.split(".")[1].rsplit("-", 1)[0] for path in code}
@@ -181,7 +181,7 @@ def uncached(function: Callable[..., Any]) -> Any:
 
 
 class _Locator(InTreeCacheLocator):  # type: ignore[misc]
-    """Where numba keeps code: in one folder, whatever the place and the date of the file that a function stands in."""
+    """Where numba keeps code: in one folder, independent of place and date of the file that defines a function."""
 
     def ensure_cache_path(self) -> None:
         """It is there, and may be read-only."""

@@ -60,9 +60,9 @@ def layout(cls: Any) -> tuple[Field, ...]:
 
 
 def pack(arrays: Any) -> tuple[Any, ...]:
-    """Return the arrays of a table one behind the other: integers and floats, and singles where there are any.
+    """Return the arrays of a table one after the other: integers and floats, and singles where there are any.
 
-    The integers begin with the first and last place of every field, see :func:`table_view`.
+    The integers start with the first and last place of every field, see :func:`table_view`.
     """
     fields = layout(arrays.__class__)
     places: list[int] = []
@@ -129,8 +129,8 @@ def new_buffers(cls: Any, **dimensions: int) -> tuple[Integers, Floats, Any]:
     integers, floats = (np.zeros(n, t) for n, t in zip(buffer_sizes(cls, **dimensions), (np.int64, float), strict=True))
     views, ends = [], {True: 0, False: 0}
     for field in layout(cls):
-        begin = ends[field.integer]
+        start = ends[field.integer]
         ends[field.integer] += math.prod(field.sized(dimensions))
         buffer = integers if field.integer else floats
-        views.append(buffer[begin : ends[field.integer]].reshape(field.sized(dimensions)))
+        views.append(buffer[start : ends[field.integer]].reshape(field.sized(dimensions)))
     return integers, floats, cls(*views)

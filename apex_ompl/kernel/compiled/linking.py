@@ -17,7 +17,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import FunctionPass, register_pass
 from numba.core.typed_passes import NopythonTypeInference
 
-ENVIRONMENT = "_ZN08NumbaEnv"  # beginning of the names of numba's environments, whose addresses it asks for
+ENVIRONMENT = "_ZN08NumbaEnv"  # prefix of the names of numba's environments, whose addresses it asks for
 
 
 class InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -36,7 +36,7 @@ class InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return what Python calls: a function of its own that raises TypeError, whatever its arguments."""
+        """Return what Python calls: a function that raises TypeError for any arguments."""
         del name
         self._ensure_finalized()
         return int(ctypes.cast(ctypes.pythonapi.PyErr_BadArgument, ctypes.c_void_p).value or 0)

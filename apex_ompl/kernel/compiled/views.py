@@ -83,7 +83,7 @@ def buffer_code(cls: Any, fields: Sequence[Any], dimensions: Sequence[str]) -> C
 
 
 def _arrays(cls: Any, fields: Sequence[Any], buffers: Sequence[Any], whole: bool = False) -> Any:
-    """Return numba's type of the named tuple; ``whole`` says that shapes are those of arrays and not of rows."""
+    """Return numba's type of the named tuple; ``whole`` where shapes are those of arrays and not of rows."""
     numbers = int64, float64, float32
     wanted = [Array(n, 1, "C", readonly=not buffer.mutable) for n, buffer in zip(numbers, buffers, strict=False)]
     if list(buffers) != wanted:
@@ -102,7 +102,7 @@ def _sources(context: Any, builder: Any, signature: Any, arguments: Sequence[Any
 
 
 def _slice(context: Any, builder: Any, array: Any, source: Any, first: Any, sizes: Sequence[Any]) -> Any:
-    """Return the array of a shape that begins at one of the numbers of a buffer."""
+    """Return the array of a shape that starts at one of the numbers of a buffer."""
     found, step = make_array(array)(context, builder), INT(8)  # bytes of a number
     strides = [step]
     for size in reversed(sizes[1:]):

@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 from apex_ompl.kernel.compiled.arrays import RUN, RobotArrays
 from apex_ompl.kernel.compiled.compilation import ir_inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_sizes, buffer_view
-from apex_ompl.kernel.compiled.sincos import TOGETHER
+from apex_ompl.kernel.compiled.packet.sincos import TOGETHER
 
 
 class Workspace(NamedTuple):
@@ -24,10 +24,10 @@ class Workspace(NamedTuple):
         angle: Values of joints that are to be placed [rad], [m].
         cosine: Their cosines.
         sine: Their sines.
-        moving: Whether clusters move: else the bounds below are not looked at.
+        moving: Whether clusters move: else the bounds below are ignored.
         margin: Distance by which pairs that move must be apart [m].
         arc_bound: Bound by lengths of arcs on the displacement of a cluster's spheres, relative to the frames of the
-            joints above it [m]; for this and the next two see :mod:`apex_ompl.kernel.compiled.motion_bound`.
+            joints above it [m]; for this and the next two see :mod:`apex_ompl.kernel.compiled.robot.motion_bound`.
         linear: Displacement of a cluster's ball to first order, relative to the same frames, in the world's axes [m].
         remainder: Bound on what the displacement of any of its spheres differs from ``linear`` by [m].
         step: Half of a straight motion through the state.

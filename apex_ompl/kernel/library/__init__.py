@@ -1,7 +1,7 @@
 """The kernel's compiled functions, built ahead of time into one library for each architecture, and checked when loaded.
 
 ``scripts/build_kernel.py`` builds the library from the code that numba makes of :mod:`apex_ompl.kernel.compiled`, for
-processors of level x86-64-v3 (AVX2 and FMA, since 2013) and for 64-bit ARM, and a file beside it says from which
+processors of level x86-64-v3 (AVX2 and FMA, since 2013) and for 64-bit ARM, and a description beside it names their
 sources. Where it does not fit, because the sources were edited, or the processor or the system is another one, or the
 file is damaged, numba compiles the functions when they are needed. ``$APEX_OMPL_KERNEL`` may ask for ``numba``.
 """
@@ -40,8 +40,9 @@ class BrokenLibraryError(LibraryError):
 def sources_digest() -> str:
     """Return a digest of all files of the kernel's compiled functions."""
     digest = hashlib.sha256()
-    for path in sorted(SOURCES.glob("*.py")):
-        digest.update(f"{path.name} {path.stat().st_size}\n".encode() + path.read_bytes())
+    for path in sorted(SOURCES.rglob("*.py")):
+        name = path.relative_to(SOURCES).as_posix()
+        digest.update(f"{name} {path.stat().st_size}\n".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
@@ -55,10 +56,10 @@ def library_file(machine: str) -> Path:
 
 def built_function(function: Callable[..., Any]) -> Callable[..., Any] | None:
     """Return a function of :mod:`apex_ompl.kernel.compiled` as the library has it, or None where it does not fit."""
-    if function.__module__.rpartition(".")[0] != PACKAGE:
+    if not function.__module__.startswith(f"{PACKAGE}."):
         return None
     functions, _ = _found()
-    return functions.get(f"{function.__module__.rpartition('.')[2]}.{function.__name__}")
+    return functions.get(f"{function.__module__.removeprefix(f'{PACKAGE}.')}.{function.__name__}")
 
 
 def is_used() -> bool:

@@ -58,7 +58,7 @@ static int put_number(char kind, PyObject *value, int64_t *slot) {
     return *slot == -1 && PyErr_Occurred() ? -1 : 0;
 }
 
-/* Puts the fields of an array into slots, and returns the one behind them, or NULL with an exception set. */
+/* Puts the fields of an array into slots, and returns the slot after them, or NULL with an exception set. */
 static int64_t *put_array(const Entry *entry, const char *kind, PyObject *value, Py_ssize_t place, int64_t *slot) {
     int axes = kind[1] - '0';
     int type = *kind == 'd' ? NPY_DOUBLE : *kind == 'f' ? NPY_FLOAT : *kind == 'b' ? NPY_BYTE : NPY_LONG;
@@ -80,7 +80,7 @@ static int64_t *put_array(const Entry *entry, const char *kind, PyObject *value,
     return slot;
 }
 
-/* Puts a value of the kind at *kind into slots, moves *kind behind it, and returns the slot behind them, or NULL. */
+/* Puts a value of the kind at *kind into slots, moves *kind past it, and returns the slot after them, or NULL. */
 static int64_t *put(const Entry *entry, const char **kind, PyObject *value, Py_ssize_t place, int64_t *slot) {
     char first = **kind;
     if (first == '(') {

@@ -10,7 +10,7 @@ import numpy as np
 from apex_ompl.apex.models import Model, trajectory_model
 from apex_ompl.apex.query import make_query
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.kernel.trees import TreePair
+from apex_ompl.kernel.search import TreePair
 from apex_ompl.model.query import Query
 from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.search import (

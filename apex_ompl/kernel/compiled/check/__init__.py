@@ -1,0 +1,1 @@
+"""Collision checks of states, motions and curves: clearances with gradients, and proofs."""

@@ -1,0 +1,1 @@
+"""Distances between shapes, without a robot: primitives, grids, triangles, convex pieces, clouds and trees."""

@@ -1,0 +1,1 @@
+"""Arithmetic on several numbers at once: sines, products of vectors and of matrices."""

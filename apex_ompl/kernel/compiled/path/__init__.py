@@ -1,0 +1,1 @@
+"""Search, shortcuts and optimization of paths among static obstacles."""

@@ -1,0 +1,1 @@
+"""Motions over time: cubic pieces, jerk profiles and time parameterization."""
