@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.api import load_problem, plan, setup
+    from apex_ompl.api import load_problem, plan, run, setup
     from apex_ompl.collision.cloud_contact import filter_points
     from apex_ompl.errors import ApexError
     from apex_ompl.loop.result import RunResult
-    from apex_ompl.loop.run import run
     from apex_ompl.loop.sensor import Sensor
     from apex_ompl.model.checkpoint import load_model
     from apex_ompl.moving.retime import retime
@@ -61,7 +60,7 @@ _HOMES = {  # modules that public names are imported from when they are first us
     "plan": "api",
     "points_from_depth": "scene.points",
     "retime": "moving.retime",
-    "run": "loop.run",
+    "run": "api",
     "setup": "api",
     "time_path": "timing",
     "view": "viz.view",

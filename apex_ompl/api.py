@@ -1,11 +1,11 @@
-"""The Python planning API: ``load_problem``, ``setup`` and ``plan``."""
+"""The Python API: ``load_problem``, ``setup``, ``plan`` and ``run``."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ompl import geometric as og
 
@@ -20,6 +20,13 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
 from apex_ompl.util.files import is_file, path_text
 from apex_ompl.util.forking import unforked
+
+if TYPE_CHECKING:
+    from apex_ompl.loop.environment import Environment
+    from apex_ompl.loop.result import RunResult
+    from apex_ompl.loop.sensor import Sensor
+    from apex_ompl.moving.replanner import Replanner
+    from apex_ompl.moving.settings import LoopSettings
 
 
 @unforked()
@@ -112,3 +119,62 @@ def plan(
             loaded, planner, timeout=timeout, seed=seed, simplify=simplify, params=params, snapshot=snapshot,
             timing=timing, leave_contact=leave_contact,
         )  # fmt: skip
+
+
+def run(
+    problem: Problem | Environment | str | os.PathLike[str],
+    method: str | Replanner = "apex",
+    *,
+    clock: str = "sim",
+    prediction: str = "cv",
+    seed: int = 0,
+    speed: float = 1.0,
+    settings: LoopSettings | None = None,
+    sensor: Sensor | None = None,
+) -> RunResult:
+    """Let a robot go to a goal while obstacles move.
+
+    The robot observes obstacles by a sensor and tracks them. It follows a motion only as long as a stop after its next
+    step is proved clear of the reachable sets of all obstacles, and replans where its motion meets the prediction.
+
+    Args:
+        problem: A world by its name (:func:`apex_ompl.problems.worlds.load`), a problem some of whose obstacles move,
+            its name or its file; or an environment (:class:`apex_ompl.loop.environment.Environment`).
+        method: Name of a replanner (:func:`apex_ompl.loop.replan.methods.names`), or a replanner of your own
+            (:class:`apex_ompl.moving.replanner.Replanner`).
+        clock: ``sim``, on which work takes its time by a compute-cost model, so that the same seed gives the same run;
+            or ``real``, the wall clock, with the replanner in a process of its own, which it is pickled to.
+        prediction: ``still``, ``cv`` or ``truth``, see :class:`apex_ompl.moving.settings.LoopSettings`.
+        seed: Seed of random choices, and of the sensor where none is given.
+        speed: Share of the velocity limits that motions use, 0.001 to 1.
+        settings: Parameters of the loop; ``prediction`` counts instead of theirs. Their largest error and speed are by
+            default those of the sensor and the environment.
+        sensor: How obstacles are observed.
+
+    Raises:
+        ApexError: The world, the problem, a name or a number is unknown or faulty.
+    """
+    from apex_ompl.loop.run import run_in
+
+    return run_in(
+        load_environment(problem), method, clock=clock, prediction=prediction, seed=seed, speed=speed,
+        settings=settings, sensor=sensor,
+    )  # fmt: skip
+
+
+def load_environment(problem: Problem | Environment | str | os.PathLike[str]) -> Environment:
+    """Return the environment of a problem, of the name of a world or a problem, or of a problem file.
+
+    Raises:
+        ApexError: It is unknown or faulty.
+    """
+    from apex_ompl.problems import worlds
+    from apex_ompl.problems.world_scripts import environment_of
+
+    if isinstance(problem, Problem):
+        return environment_of(problem)
+    if isinstance(problem, str | os.PathLike):
+        return worlds.load(path_text(problem, "problem"))
+    if not all(hasattr(problem, name) for name in ("present", "script", "ran")):
+        raise ParameterError("problem", problem, "a problem, its name, its file, or an environment")
+    return problem

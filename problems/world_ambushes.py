@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
-from apex_ompl.problems.world_scripts import ScriptedWorld
+from apex_ompl.problems.world_scripts import ScriptedEnvironment
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
@@ -28,13 +28,13 @@ LEAST_SPEED = 0.02  # of a hand that a cube appears before [m/s]
 PLANNED_CLEARANCE, CLEARANCE = (
     0.08,
     0.04,
-)  # of the robot to a cube when it appears: as it is drawn, and least; of ``interceptor`` at the begin [m]
+)  # of the robot to a cube when it appears: as it is drawn, and least; of ``interceptor`` at the start [m]
 LEAST_HEADING = 0.02  # way of a cube that moves to where the hand is going [m]
 GOAL_CLEARANCE = 0.03  # of a cube that stands to the goal [m]
-LEADS = (0.4, 1.5)  # between the begin of the first motion and its meeting with a cube [s]
+LEADS = (0.4, 1.5)  # between the start of the first motion and its meeting with a cube [s]
 
 
-class AmbushWorld(ScriptedWorld):
+class AmbushEnvironment(ScriptedEnvironment):
     """A world of one cube, which is made by the robot's first motion."""
 
     foreseen = -math.inf
@@ -57,12 +57,12 @@ class AmbushWorld(ScriptedWorld):
         return self._robot.balls(q).clearance(place, self._edge) >= gap
 
     def _make(self, place: Array, velocity: Array, time: float) -> None:
-        """Make the cube at a place, shape (3,) [m], and at a time [s]; from then on all is decided."""
+        """Make the cube at a place, shape (3,) [m], and at a time [s], which fixes its motion."""
         made = cube("cube_0", self._edge, place - time * velocity, velocity)
         self._obstacles, self.foreseen = (made.model_copy(update={"appears": float(time)}),), math.inf
 
 
-class PopupWorld(AmbushWorld):
+class PopupEnvironment(AmbushEnvironment):
     """A cube comes into being .25 to .6 m before a hand, in the direction of the hand's motion.
 
     It does so when the robot has done a share of its first motion, or as soon after that as it has room. It stands,
@@ -71,17 +71,17 @@ class PopupWorld(AmbushWorld):
     """
 
     def __init__(self, name: str, problem: Problem, edge: float, rng: np.random.Generator) -> None:
-        """Draw whether and how fast the cube moves; see :class:`AmbushWorld`."""
+        """Draw whether and how fast the cube moves; see :class:`AmbushEnvironment`."""
         super().__init__(name, problem, edge, rng, 0.0 if rng.random() < STILL_SHARE else float(rng.uniform(*SPEEDS)))
         self._planned: tuple[float, Array, Array] | None = None
 
-    def begin(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s]: decide when and where the cube will come into being.
+    def start(self, motion: Trajectory, time: float) -> None:
+        """Take the first motion, and when it starts [s]: decide when and where the cube will come into being.
 
         Raises:
             ParameterError: The time is before the last step.
         """
-        super().begin(motion, time)
+        super().start(motion, time)
         for number in range(DRAWS):
             drawn = self._drawn(motion, in_the_way=2 * number < DRAWS)
             if drawn is not None:
@@ -130,24 +130,24 @@ class PopupWorld(AmbushWorld):
         return (moment, place, velocity) if any(meets) or not in_the_way else None
 
 
-class InterceptorWorld(AmbushWorld):
-    """A cube at constant velocity would meet a hand .4 to 1.5 s behind the begin of the first motion.
+class InterceptorEnvironment(AmbushEnvironment):
+    """A cube at constant velocity would meet a hand .4 to 1.5 s after the start of the first motion.
 
-    It is there from that begin on, clear of the robot then, and its front face comes to where the motion has the hand,
+    It is there from that start on, clear of the robot then, and its front face comes to where the motion has the hand,
     at its end if it ends before.
     """
 
     def __init__(self, name: str, problem: Problem, edge: float, rng: np.random.Generator) -> None:
-        """Draw the speed; see :class:`AmbushWorld`."""
+        """Draw the speed; see :class:`AmbushEnvironment`."""
         super().__init__(name, problem, edge, rng, float(rng.uniform(*SPEEDS)))
 
-    def begin(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s]: the cube is there from then on.
+    def start(self, motion: Trajectory, time: float) -> None:
+        """Take the first motion, and when it starts [s]: the cube exists afterwards.
 
         Raises:
             ParameterError: The time is before the last step.
         """
-        super().begin(motion, time)
+        super().start(motion, time)
         rng, robot = self._rng, self._robot
         for _ in range(DRAWS):
             lead, link = rng.uniform(*LEADS), robot.hands[int(rng.integers(len(robot.hands)))]

@@ -11,7 +11,7 @@ import numpy as np
 
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
-from apex_ompl.problems.world_scripts import ScriptedWorld
+from apex_ompl.problems.world_scripts import ScriptedEnvironment
 from apex_ompl.scene.bodies import PlaceInTime
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import place_at, row_of
@@ -20,7 +20,7 @@ from apex_ompl.types import Array
 
 SPEED = 0.15  # [m/s]
 STAYS = 3.0  # from when it sets out to when it turns back [s]
-WAITS = (0.0, 1.0)  # behind the begin of the first motion, before it sets out [s]
+WAITS = (0.0, 1.0)  # after the start of the first motion, before it starts [s]
 PERIOD = 0.1  # least time between two of its decisions [s]
 GAPS = (0.25, 0.4)  # to the robot at the start, from outside [m]
 SIDE = math.radians(70.0)  # largest angle between the direction that it comes from and the front
@@ -28,7 +28,7 @@ FARTHEST, SCAN, PLACES = 1.5, 0.02, 200  # of its place from a hand [m], steps i
 ROUNDING = 1e-9  # of times [s]
 
 
-class PusherWorld(ScriptedWorld):
+class PusherEnvironment(ScriptedEnvironment):
     """A cube that stands before the robot, comes towards the nearest link, and leaves the way it came.
 
     Links that stay at the bases are not what it comes for, and it stands before a column above a base, where an arm
@@ -55,13 +55,13 @@ class PusherWorld(ScriptedWorld):
         self._rows = [row_of(0.0, place)]
         self._wait, self._sets_out, self._decided = float(rng.uniform(*WAITS)), math.inf, -math.inf
 
-    def begin(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s].
+    def start(self, motion: Trajectory, time: float) -> None:
+        """Take the first motion, and when it starts [s].
 
         Raises:
             ParameterError: The time is before the last step.
         """
-        super().begin(motion, time)
+        super().start(motion, time)
         self._sets_out = time + self._wait
 
     def advance(self, time: float, q: Array) -> None:

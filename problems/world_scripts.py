@@ -1,11 +1,11 @@
-"""Worlds whose obstacles move by records of the scene: fixed from the beginning, or made when the robot sets out."""
+"""Environments whose obstacles move by records of the scene: fixed from the start, or made when the robot starts."""
 
 from __future__ import annotations
 
 import math
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.problems.worlds import World
+from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import fastest, is_there, obstacle_at, recorded
@@ -14,8 +14,8 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number
 
 
-class ScriptedWorld(World):
-    """A world of obstacles with a velocity or a script.
+class ScriptedEnvironment(DynamicEnvironment):
+    """An environment of obstacles with a velocity or a script.
 
     Attributes:
         foreseen: Time up to which ``present`` may be asked, besides the last step [s]; infinite where all is fixed.
@@ -24,20 +24,20 @@ class ScriptedWorld(World):
     foreseen: float = math.inf
 
     def __init__(self, name: str, problem: Problem, obstacles: tuple[Obstacle, ...], fastest: float) -> None:
-        """Make a world.
+        """Make an environment.
 
         Args:
             name: Its name.
-            problem: What stands still.
-            obstacles: What moves, from time 0 on.
-            fastest: Largest speed that there will be [m/s].
+            problem: Static obstacles, start and goal.
+            obstacles: Moving obstacles, from time 0 on.
+            fastest: Their largest speed [m/s].
         """
         self.name, self.problem, self.fastest = name, problem, fastest
         self._obstacles = obstacles
         self._now = 0.0
 
-    def begin(self, motion: Trajectory, time: float) -> None:
-        """Take the first motion, and when it begins [s].
+    def start(self, motion: Trajectory, time: float) -> None:
+        """Take the first motion, and when it starts [s].
 
         Raises:
             ParameterError: The time is before the last step.
@@ -73,10 +73,10 @@ class ScriptedWorld(World):
         return self._obstacles
 
 
-def moving_world(problem: Problem) -> ScriptedWorld:
-    """Return the world of a problem's own obstacles, which do what their records say whatever the robot does.
+def environment_of(problem: Problem) -> ScriptedEnvironment:
+    """Return the environment of a problem's own obstacles, which move by their records whatever the robot does.
 
-    Obstacles with a velocity go on for ever.
+    Obstacles with a velocity move for ever.
 
     Raises:
         ParameterError: A pair of bodies that may touch names an obstacle that moves.
@@ -85,4 +85,4 @@ def moving_world(problem: Problem) -> ScriptedWorld:
     if touching is not None:
         raise ParameterError("allowed", touching, "no obstacle that moves in a pair that may touch")
     dynamic = tuple(o for o in problem.scene if o.moving)
-    return ScriptedWorld(problem.name, problem.still, dynamic, max(map(fastest, dynamic), default=0.0))
+    return ScriptedEnvironment(problem.name, problem.still, dynamic, max(map(fastest, dynamic), default=0.0))

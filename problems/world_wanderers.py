@@ -13,7 +13,7 @@ import numpy as np
 
 from apex_ompl.problems.generator import SuiteError
 from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
-from apex_ompl.problems.world_scripts import ScriptedWorld
+from apex_ompl.problems.world_scripts import ScriptedEnvironment
 from apex_ompl.scene.bodies import Obstacle, PlaceInTime
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import row_of
@@ -86,7 +86,7 @@ def direction(rng: np.random.Generator) -> Array:
     return np.asarray(drawn / np.linalg.norm(drawn))
 
 
-class WanderersWorld(ScriptedWorld):
+class WanderersEnvironment(ScriptedEnvironment):
     """Cubes at constant speed, each one its own, that are reflected, and that turn if they are told to.
 
     They do not depend on what the robot does.

@@ -8,7 +8,7 @@ into those for training, validation and tests as the suites' are.
 
 - ``moving``: obstacles do what their problem says, whatever the robot does.
 - ``popup``: a cube comes into being before a hand during the first motion (:mod:`apex_ompl.problems.world_ambushes`).
-- ``interceptor``: a cube at constant velocity is to meet the first motion (the same module).
+- ``interceptor``: a cube at constant velocity would meet the first motion (the same module).
 - ``turning``: a cube takes a new direction every .5 to 2 s (:mod:`apex_ompl.problems.world_wanderers`).
 - ``crowd``: three cubes cross in front of the robot (the same module).
 - ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_pusher`).
@@ -41,15 +41,15 @@ GENERATED = ("popup", "interceptor", "turning", "crowd", "pusher")
 SEED = re.compile(r"0|[1-9][0-9]{0,19}")
 
 
-class World(ABC):
-    """What truly happens in a run.
+class DynamicEnvironment(ABC):
+    """What the obstacles of a run truly do.
 
-    A run calls ``begin`` once, when its first motion is committed, and ``advance`` at every step of its clock, with
+    A run calls ``start`` once, when its first motion is committed, and ``advance`` at every step of its clock, with
     times that increase from 0; ``present`` may be asked about any time up to the last step.
 
     Attributes:
         name: Its name, such as ``popup/12``.
-        problem: What stands still, start and goal, and what is held.
+        problem: Static obstacles, start and goal, and held objects.
         fastest: Largest speed of its obstacles [m/s].
         ran: Whether a run was made in it: each is good for one.
     """
@@ -63,8 +63,8 @@ class World(ABC):
         """Return the name of the world, and whether a run was made in it."""
         return one_line(type(self).__name__, repr(self.name), "ran" if self.ran else "")
 
-    def begin(self, motion: Trajectory, time: float) -> None:  # noqa: B027 - most worlds do not care
-        """Take the first motion that the robot is to follow, and when it begins [s]."""
+    def start(self, motion: Trajectory, time: float) -> None:  # noqa: B027 - most worlds do not care
+        """Take the first motion that the robot will follow, and when it starts [s]."""
 
     def advance(self, time: float, q: Array) -> None:  # noqa: B027
         """Take the robot's state, shape (dof,), at a time [s]."""
@@ -155,7 +155,7 @@ def ids(kind: str, split: str, count: int) -> tuple[str, ...]:
     return tuple(name if kind == MOVING_KIND else f"{kind}/{name}" for name in islice(every, count))
 
 
-def load(name: str) -> World:
+def load(name: str) -> DynamicEnvironment:
     """Return a world, new at each call, by its name, that of a problem, or a problem file.
 
     Raises:
@@ -164,32 +164,32 @@ def load(name: str) -> World:
         SuiteError: No problem or no place for a cube can be drawn for that seed.
         ApexError: A problem file, or a file that it names, is faulty.
     """
-    from apex_ompl.problems.world_scripts import moving_world
+    from apex_ompl.problems.world_scripts import environment_of
 
     kind, *rest = name.split("/")
     if name.endswith((".yaml", ".yml")) or Path(name).is_absolute():
-        return moving_world(Problem.load(name))
+        return environment_of(Problem.load(name))
     if kind not in GENERATED and (problems.is_id(name) or name in problems.names()):
-        return moving_world(problems.load(name))
+        return environment_of(problems.load(name))
     if not rest:
         known = (f"{one}/vertical/large/12" for one in GENERATED)
         raise UnknownNameError("world", name, (*problems.names(), *known))
     return _drawn(WorldId.parse(name))
 
 
-def _drawn(world: WorldId) -> World:
+def _drawn(world: WorldId) -> DynamicEnvironment:
     """Return the world of an id."""
-    from apex_ompl.problems.world_ambushes import InterceptorWorld, PopupWorld
-    from apex_ompl.problems.world_pusher import PusherWorld
-    from apex_ompl.problems.world_wanderers import WanderersWorld
+    from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment
+    from apex_ompl.problems.world_pusher import PusherEnvironment
+    from apex_ompl.problems.world_wanderers import WanderersEnvironment
 
     level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())
     rng = np.random.default_rng([level, world.seed])
     name, problem, edge = str(world), problems.load(str(world.problem)), SIZES[world.size]
     if world.kind == "popup":
-        return PopupWorld(name, problem, edge, rng)
+        return PopupEnvironment(name, problem, edge, rng)
     if world.kind == "interceptor":
-        return InterceptorWorld(name, problem, edge, rng)
+        return InterceptorEnvironment(name, problem, edge, rng)
     if world.kind == "pusher":
-        return PusherWorld(name, problem, edge, rng)
-    return WanderersWorld(name, problem, edge, rng, turns=world.kind == "turning")
+        return PusherEnvironment(name, problem, edge, rng)
+    return WanderersEnvironment(name, problem, edge, rng, turns=world.kind == "turning")

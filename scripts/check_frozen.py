@@ -11,7 +11,7 @@ import numpy as np
 
 from apex_ompl import problems
 from apex_ompl.errors import ApexError
-from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.moving.timed_proof import check_timed_path
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.problems import frozen

@@ -28,7 +28,7 @@ import numpy as np
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.moving.swept import check_timed_path, constant_velocity_times, inflated
+from apex_ompl.moving.timed_proof import check_timed_path, constant_velocity_times, inflated
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check

@@ -24,11 +24,11 @@ from apex_ompl.baselines.damon.manifold import (
     STORED,
     Manifold,
     ManifoldConfig,
+    StateAutoencoder,
     halved,
     save_manifold,
 )  # fmt: skip
-from apex_ompl.baselines.damon.sampling import sample_states, split_sample
-from apex_ompl.baselines.damon.state_autoencoder import StateAutoencoder
+from apex_ompl.baselines.damon.manifold_training import sample_states, split_sample
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.robot import load_robot

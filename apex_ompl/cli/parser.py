@@ -174,8 +174,8 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("run", help="go to a goal in closed loop while obstacles move")
     parser.add_argument("world", help=f"a world such as popup/vertical/large/12, or {PROBLEM_HELP}")
     parser.add_argument(
-        "--planner", default="apex", help="apex, or a method of docs/closed_loop.md such as no-network, stop-and-wait, "
-        "rrtconnect, apex-paper, blind (default: %(default)s)",
+        "--method", default="apex", help="apex, or a replanner of docs/closed_loop.md such as no-network, "
+        "stop-and-wait, rrtconnect, apex-paper, blind (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--clock", default="sim", help="sim (simulated, repeatable) or real, with the planner in its own process "

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 
+from apex_ompl import api
 from apex_ompl.loop.result import INTERRUPTED, SUFFIXES, Outcome
-from apex_ompl.loop.run import load_world
-from apex_ompl.loop.run import run as run_loop
-from apex_ompl.loop.sensor import Sensor
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.util.files import check_writable, suffix_of
 
@@ -18,12 +16,11 @@ def run(parsed: argparse.Namespace) -> int:
     if parsed.out is not None:
         suffix_of(parsed.out, SUFFIXES)
         check_writable(parsed.out)
-    world, sensor = load_world(parsed.world), Sensor(seed=parsed.seed)
     latency = -1.0 if parsed.latency is None else parsed.latency
     settings = LoopSettings(budget=parsed.budget, latency=latency, timeout=parsed.timeout, evade=parsed.evade)
-    result = run_loop(
-        world, parsed.planner, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed, speed=parsed.speed,
-        settings=settings, sensor=sensor,
+    result = api.run(
+        parsed.world, parsed.method, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed,
+        speed=parsed.speed, settings=settings,
     )  # fmt: skip
     if parsed.out is not None:
         result.save(parsed.out)

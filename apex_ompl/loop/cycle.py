@@ -1,54 +1,53 @@
-"""A run: a world that moves on, eyes that observe it, and a robot that follows exactly what it is told."""
+"""A run step by step: advance the environment, take observations, decide what the robot does, and undo late steps."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
+from apex_ompl.loop.environment import Environment, Observation, ObservationSource
 from apex_ompl.loop.executor import Executor
-from apex_ompl.loop.late_steps import Decided, undo
-from apex_ompl.loop.observation import Observation
 from apex_ompl.loop.replanning import Replanning
 from apex_ompl.loop.result import INTERRUPTED, Event
 from apex_ompl.loop.sensor import CUT
-from apex_ompl.loop.tracking import Tracker, TrackSettings, as_they_are
+from apex_ompl.loop.tracking import Tracker, TrackSettings, true_motions
+from apex_ompl.moving.context import SAME_TIME, Following, RunContext, executed
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
-from apex_ompl.moving.following import SAME_TIME, Following, executed
-from apex_ompl.moving.ready import Ready
-from apex_ompl.problems.worlds import World
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at, vector
 from apex_ompl.timing import Trajectory
 
-LONGEST_STOP = 5.0  # behind which a run ends that does not come to rest when the time is up [s]
-
-
-class Eyes(Protocol):
-    """What observes a world."""
-
-    def observations(self, until: float) -> Iterable[Observation]:
-        """Return the observations with stamps up to a time [s] that were not returned before, in their order."""
+LONGEST_STOP = 5.0  # after which a run ends whose robot does not come to rest when the time is up [s]
+DECISIONS = (
+    "route", "leaving", "aside", "departure", "nearest", "ending", "conflict", "contact", "conflict_since", "ahead",
+    "doing", "braking",
+)  # fmt: skip
+"""Attributes of an executor that are decided together with what it follows."""
+TAKEN = {"accepted": "rejected", "improved": "kept"}
+"""Kinds of events of answers that were taken, and of answers that were not."""
+UNDONE = ("stop", "reaction", "conflict")
+"""Kinds of events that are removed with a step."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """What came of a run.
+    """The record of a run, before the referee judges it.
 
     Attributes:
-        trajectory: What the robot did.
+        trajectory: The executed motion.
         events: What happened.
         reached: Whether the robot came to rest at a goal.
-        ended: Why the run ended else: ``timeout``, ``stuck`` or ``aborted``.
+        ended: Why the run ended otherwise: ``timeout``, ``stuck`` or ``aborted``.
         broken: Number of steps at which an obstacle was where the assumptions of the guarantee exclude it.
-        measured: What was measured on a real clock, by name.
-        reason: What there is to say of the end, or nothing.
+        measured: Computing times on the wall clock, by name.
+        reason: Why the run ended, where more is known.
         unguarded: Number of steps at which the robot moved without a fail-safe stop.
         refused: Number of observations that were refused.
-        doubted: Number of observed places that contradicted what was known.
+        doubted: Number of observed places that contradicted earlier ones.
     """
 
     trajectory: Trajectory
@@ -64,61 +63,62 @@ class RunRecord:
 
     @property
     def counts(self) -> dict[str, float]:
-        """What was counted, as metrics have it."""
+        """Counts by the names of metrics."""
         counts = {"broken_steps": self.broken, "unguarded_steps": self.unguarded}
         counts |= {"refused_looks": self.refused, "doubted_places": self.doubted}
         return {name: float(count) for name, count in counts.items()}
 
 
 class Loop:
-    """One run under way, step by step, on whatever clock.
+    """One run, step by step, on any clock.
 
     Attributes:
         executor: Decides what the robot follows.
     """
 
     def __init__(
-        self, world: World, ready: Ready, replanning: Replanning, eyes: Eyes, seed: int, *, lead: float = 0.0
+        self, environment: Environment, context: RunContext, replanning: Replanning, sensor: ObservationSource,
+        seed: int, *, lead: float = 0.0,
     ) -> None:  # fmt: skip
-        """Begin with a robot that stands at the start.
+        """Set up a run with the robot at rest at the start.
 
         Args:
-            world: What truly happens.
-            ready: The robot among what stands still.
-            replanning: Who plans motions anew.
-            eyes: What observes the world.
-            seed: Of random choices.
+            environment: What truly happens.
+            context: The robot among static obstacles, and the settings of the run.
+            replanning: Answers requests for replans.
+            sensor: Observes the environment.
+            seed: Seed of random choices.
             lead: How long before a step it is decided [s].
         """
-        self._world, self._ready, self._eyes = world, ready, eyes
-        self._allowed = tuple(ready.setup.problem.allowed)
-        error, fastest = ready.settings.assumed
-        self._present: tuple[Obstacle, ...] = tuple(world.present(0.0))
+        self._environment, self._context, self._sensor = environment, context, sensor
+        self._allowed = tuple(context.setup.problem.allowed)
+        error, fastest = context.settings.assumed
+        self._present: tuple[Obstacle, ...] = tuple(environment.present(0.0))
         self._tracker = Tracker(
-            ready.kernel, TrackSettings(noise=error / CUT), self._allowed, error, fastest, ready.settings.memory,
+            context.kernel, TrackSettings(noise=error / CUT), self._allowed, error, fastest, context.settings.memory,
             {o.name for o in self._present},
         )  # fmt: skip
-        start = ready.setup.start
-        standing = Following.standing(start, 0.0, ready.names, to_goal=ready.is_goal(start))
+        start = context.setup.start
+        standing = Following.resting(start, 0.0, context.names, to_goal=context.is_goal(start))
         self.executor = Executor(
-            ready, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
+            context, replanning, self._tracker, seed, standing, followed=[(0.0, standing)], lead=lead
         )  # fmt: skip
         self._waiting: list[Observation] = []
-        self._begun, self._rest, self._broken, self._refused, self._doubted = False, 0.0, 0, 0, 0
-        self._looked, self._closed, self._aborted, self._refusal = 0.0, 0.0, "", ""
+        self._started, self._rest, self._broken, self._refused, self._doubted = False, 0.0, 0, 0, 0
+        self._present_time, self._closed, self._aborted, self._refusal = 0.0, 0.0, "", ""
 
     def advance(self, now: float) -> None:
-        """Let the world move on to a time [s], and be looked at."""
-        self._world.advance(now, self.executor.state(now))
+        """Advance the environment to a time [s], and collect the observations until then."""
+        self._environment.advance(now, self.executor.state(now))
         if not self._aborted:
             try:
-                self._waiting += self._eyes.observations(now)
-            except Exception as error:  # whatever a sensor does, the robot stops and the run is returned
+                self._waiting += self._sensor.observations(now)
+            except Exception as error:  # whatever a sensor raises, the robot stops and the run is returned
                 self.abort(f"the sensor failed, {type(error).__name__}: {error}")
-        self._present, self._looked = tuple(self._world.present(now)), now
+        self._present, self._present_time = tuple(self._environment.present(now)), now
 
     def abort(self, why: str = "the interpreter ended") -> None:
-        """Let the robot stop, and the run end for a reason; may be called from any thread."""
+        """Stop the robot and end the run for a reason; may be called from any thread."""
         self._aborted = self._aborted or why
 
     def interrupt(self, now: float, before: Decided) -> None:
@@ -126,7 +126,7 @@ class Loop:
 
         Args:
             now: Time of the step [s].
-            before: What had been decided before it.
+            before: Decisions before the step.
 
         Raises:
             KeyboardInterrupt: The run was aborted before.
@@ -137,7 +137,7 @@ class Loop:
         self.abort(INTERRUPTED)
 
     def observe(self, now: float) -> None:
-        """Take the observations that have arrived by a time [s], to which the world has moved on."""
+        """Take the observations that were received by a time [s], to which the environment was advanced."""
         later = []
         for observation in self._waiting:
             if observation.received > now + 1e-9:
@@ -155,14 +155,14 @@ class Loop:
         self._broken += unexpected(self._tracker, self._present, now)
 
     def step(self, now: float) -> RunRecord | None:
-        """Decide what the robot does from a time on [s], and return what came of the run where it is over."""
-        settings, tracker, executor = self._ready.settings, self._tracker, self.executor
+        """Decide what the robot does from a time on [s], and return the record of the run where it is over."""
+        settings, tracker, executor = self._context.settings, self._tracker, self.executor
         if settings.prediction == "truth":
-            predicted = as_they_are(self._ready.kernel, self._present, self._looked, self._allowed)
+            predicted = true_motions(self._context.kernel, self._present, self._present_time, self._allowed)
         else:
             predicted = tracker.predicted(settings.margin, settings.prediction)
             soon = now + np.array([0.0, 1.0, 2.0]) * settings.budget
-            tracker.eased(predicted, executor.state(now), soon)
+            tracker.ease_margins(predicted, executor.state(now), soon)
         if (self._aborted or now >= settings.timeout - SAME_TIME) and not executor.done(now):
             executor.close(now)
         executor.step(now, predicted, partial(self._records, predicted, now))
@@ -176,18 +176,18 @@ class Loop:
         over = executor.closed and (executor.following.at_rest(now) or now >= self._closed + LONGEST_STOP)
         return self._ended(now, False, "aborted" if self._aborted else "timeout") if over else None
 
-    def set_out(self, now: float) -> None:
-        """Tell the world of the first motion, where there is one by a time [s], that of the last step."""
+    def announce_start(self, now: float) -> None:
+        """Tell the environment of the first motion to a goal, once; the time is that of the last step [s]."""
         route = self.executor.route
-        if not self._begun and route is not None:
-            self._world.begin(route.motion, max(route.begin, now))
-            self._begun = True
+        if not self._started and route is not None:
+            self._environment.start(route.motion, max(route.start_time, now))
+            self._started = True
 
     def _records(self, predicted: DynamicObstacles, now: float) -> tuple[Obstacle, ...]:
-        """Return the obstacles where they are expected to be now, with the velocities that are expected."""
-        prediction, tracks = self._ready.settings.prediction, self._tracker.tracks
+        """Return the obstacles at their predicted places now, with their predicted velocities."""
+        prediction, tracks = self._context.settings.prediction, self._tracker.tracks
         if prediction == "truth":
-            return tuple(obstacle_at(o, now - self._looked) for o in self._present)
+            return tuple(obstacle_at(o, now - self._present_time) for o in self._present)
         places = predicted.at(now)
         velocities = {name: np.zeros(3) if prediction == "still" else track.velocity for name, track in tracks.items()}
         return tuple(
@@ -199,9 +199,9 @@ class Loop:
         trajectory, reason = executed(self.executor.followed, now), self._aborted
         if not reached and not reason:
             awaited = f"never seen: {', '.join(sorted(self._tracker.awaited))}" if self._tracker.awaited else ""
-            blind = "no look was of use in the end" if self.executor.blind(now) else ""
-            last = f"{self._refused} looks were refused, the last one since {self._refusal}" if self._refused else ""
-            reason = "; ".join(filter(None, (awaited, blind, last)))
+            blind = "no observation was usable in the end" if self.executor.blind(now) else ""
+            refused = f"{self._refused} observations were refused, the last one since {self._refusal}"
+            reason = "; ".join(filter(None, (awaited, blind, refused if self._refused else "")))
         return RunRecord(
             trajectory, tuple(self.executor.events), reached, why, self._broken, reason=reason,
             unguarded=self.executor.unguarded, refused=self._refused, doubted=self._doubted,
@@ -209,9 +209,60 @@ class Loop:
 
 
 def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float) -> bool:
-    """Whether an obstacle is where the assumptions of the guarantee exclude it: unseen, or farther than it can be."""
+    """Whether an obstacle violates the assumptions of the guarantee: unseen, or outside its reachable set."""
     for o in present:
         known = [track for track in (*tracker.tracks.values(), *tracker.doubted) if track.shape.name == o.name]
         if not any(tracker.may_be(track, o, now, errors=1) for track in known):
             return True
     return False
+
+
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """The decisions of an executor before a step, so that the step can be undone.
+
+    Attributes:
+        following: The motion that the robot followed.
+        stop: The fail-safe stop.
+        events: Number of events.
+        others: The attributes ``DECISIONS`` by name.
+    """
+
+    following: Following
+    stop: Following | None
+    events: int
+    others: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, executor: Executor) -> Decided:
+        """Return the decisions of an executor so far."""
+        others = {name: getattr(executor, name) for name in DECISIONS}
+        return cls(executor.following, executor.stop, len(executor.events), others)
+
+
+def undo(executor: Executor, time: float, before: Decided) -> None:
+    """Undo a step that was decided too late: follow what the driver holds from a time on.
+
+    Args:
+        executor: The executor.
+        time: Clock time [s].
+        before: Decisions before the step; their stop, if there is one, starts at that time.
+    """
+    undone = executor.events[before.events :]
+    del executor.events[before.events :]
+    for event in undone:
+        if event.kind in TAKEN:
+            kept = {name: event.data[name] for name in ("number", "part", "took")}
+            executor.log(event.time, TAKEN[event.kind], why="the step that took it came too late", **kept)
+        elif event.kind not in UNDONE:
+            executor.events.append(event)
+    executor.log(time, "late")
+    for name, value in before.others.items():
+        setattr(executor, name, value)
+    executor.stop, executor.following = before.stop, before.following
+    if executor.stop is not None and not executor.following.at_rest(time):
+        executor.following = executor.stop
+    if executor.following is not executor.followed[-1][1]:
+        executor.follow(executor.following, time)
+    if executor.pending is not None and executor.pending.following is not executor.following:
+        executor.pending = None

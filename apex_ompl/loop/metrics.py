@@ -1,4 +1,4 @@
-"""Numbers of a run of the closed loop, and the failure ratio of many."""
+"""Metrics of a run of the closed loop, and the failure ratio of many runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from apex_ompl.timing.trajectory import rests
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import check_number
 
-NEAR = 0.5  # time before a conflict from which on it counts as near [s]
+NEAR = 0.5  # time before a conflict below which it counts as near [s]
 COUNTED = {
     "replans_asked": "request", "replans_accepted": "accepted", "replans_rejected": "rejected",
     "improvements_asked": "improve", "improvements": "improved",
@@ -28,18 +28,18 @@ COUNTED = {
 def run_metrics(
     trajectory: Trajectory, events: Sequence[Event], limits: Limits, *, clearance: float = float("inf")
 ) -> dict[str, float]:
-    """Return the metrics of a run by name; those that do not exist are left out.
+    """Return the metrics of a run by name; undefined ones are left out.
 
     - ``time_to_goal``: time of the first ``goal`` event [s], if there is one.
-    - ``rest_time``: how long the robot stood [s], and ``stops``: how often it came to rest. Where the goal was reached,
-      the rest at the end of the motion counts for neither; standing at the beginning is no stop.
+    - ``rest_time``: how long the robot was at rest [s], and ``stops``: how often it came to rest. Where the goal was
+      reached, the rest at the end of the motion counts for neither; rest at the start is no stop.
     - ``replans_asked``, ``replans_accepted``, ``replans_rejected``, ``improvements_asked``, ``improvements``,
       ``conflicts``, ``evasions`` and ``broken_assumptions``: numbers of events.
-    - ``reaction_p50`` and ``reaction_p95``: percentiles of ``seconds`` of the ``reaction`` events [s]: how long after a
-      conflict was first predicted, wherever on the rest of the motion, the command changed.
-    - ``near_reaction_p50`` and ``near_reaction_p95``: those of conflicts that were less than half a second ahead of a
-      robot on its way: where it brakes already the command has changed before, and where it stands a plan is needed.
-    - ``clearance``: the one given, if it is finite [m].
+    - ``reaction_p50`` and ``reaction_p95``: percentiles of ``seconds`` of the ``reaction`` events [s]: time from the
+      first prediction of a conflict, anywhere on the remaining motion, to the change of the command.
+    - ``near_reaction_p50`` and ``near_reaction_p95``: those of conflicts less than half a second ahead of a moving
+      robot. Where it brakes already the command has changed before, and a robot at rest needs a plan.
+    - ``clearance``: the given one, if it is finite [m].
     - ``duration`` [s], ``spectral_arc_length``, and ``jerk``, root mean square over time [rad/s^3], of the motion.
     - ``position_use``, ``velocity_use``, ``acceleration_use`` and ``jerk_use``: largest shares of the limits, and
       ``limit_use``, the largest of these.
@@ -48,7 +48,7 @@ def run_metrics(
         trajectory: The executed motion from time 0 on.
         events: What happened.
         limits: Those of the robot.
-        clearance: Least distance to obstacles that move [m]; infinite without one.
+        clearance: Least distance to dynamic obstacles [m]; infinite without one.
 
     Raises:
         ParameterError: A ``reaction`` event without a number of seconds, or the limits are those of other joints.
@@ -97,9 +97,9 @@ class FailureRatio:
     Attributes:
         failed: Number of runs that failed.
         total: Number of runs.
-        low: Lower end of Wilson's interval of the ratio.
+        low: Lower end of the Wilson confidence interval of the ratio.
         high: Upper end.
-        by_outcome: Numbers of runs by outcome, those that occur, the most frequent first.
+        by_outcome: Numbers of runs by outcome, the most frequent first.
     """
 
     failed: int
@@ -123,7 +123,7 @@ class FailureRatio:
 
 
 def failure_ratio(results: Iterable[RunResult | Outcome], confidence: float = 0.95) -> FailureRatio:
-    """Return the share of runs that failed, with its interval and split by outcome.
+    """Return the share of failed runs, with its binomial confidence interval, and the numbers by outcome.
 
     Args:
         results: The runs, or their outcomes.

@@ -1,8 +1,8 @@
-"""What truly happened in a run: contacts of the executed motion, limits, and where it ends.
+"""The referee: contacts of the executed motion, its use of the limits, and whether it ends at a goal.
 
-The motion is looked at by the exact shapes at samples ``SPACING`` apart, with each obstacle where its script has it
-then. Stretches of time that the sphere covers prove apart from all dynamic obstacles need no samples; what stands
-still, and the robot itself, is proved apart along the motion's own cubic pieces.
+The motion is checked by exact shapes at samples ``SPACING`` apart, with each obstacle at its true place. Intervals of
+time that the sphere covers prove clear of all dynamic obstacles need no samples. Static obstacles and self-collision
+are checked continuously, along the motion's own cubic pieces.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import within
 from apex_ompl.loop.result import Outcome
-from apex_ompl.moving.dynamic_obstacles import clearance_in_time, prove_motion
-from apex_ompl.moving.scripted import Piece, ScriptedDynamicObstacles
+from apex_ompl.moving.dynamic_obstacles import Piece, ScriptedDynamicObstacles, clearance_in_time, prove_motion
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
@@ -34,9 +33,9 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_states
 
 SPACING = 1e-3  # of the samples [s]
-STRETCH = 0.01  # of time that is sampled before a proof is tried anew [s]
-LIMIT_TOLERANCE = 1e-5  # share over a limit: jerk between knots that are 1 ns apart is rounded to this
-NEAR = 1e-3  # clearances of spheres that are told apart [m]
+STRETCH = 0.01  # time that is sampled before a proof is tried again [s]
+LIMIT_TOLERANCE = 1e-5  # tolerated share over a limit: rounding of the jerk between knots that are 1 ns apart
+NEAR = 1e-3  # largest clearance of spheres that is computed [m]
 
 
 @dataclass(frozen=True)
@@ -44,11 +43,11 @@ class RunContact:
     """Two bodies that overlap.
 
     Attributes:
-        time: The first sample at which they do [s].
+        time: Time of the first sample at which they overlap [s].
         first: Name of the link or the held object.
         second: Name of the obstacle, or of the other link or held object.
-        depth: Penetration depth [m]; 0 where they are too near to be proved apart.
-        moved: Whether the robot moved then.
+        depth: Penetration depth [m]; 0 where they are only too near to be proved apart.
+        moved: Whether the robot moved at that time.
     """
 
     time: float
@@ -65,17 +64,17 @@ class RunContact:
 
 @dataclass(frozen=True)
 class RefereeReport:
-    """What the referee found.
+    """The referee's report on a run.
 
     Attributes:
-        contact: First contact with an obstacle that moves, or None.
+        contact: First contact with a dynamic obstacle, or None.
         moving_contact: First contact with one while the robot moved, which may be the same, or None.
-        still_contact: First contact with what stands still or of the robot with itself, or None.
+        still_contact: First contact with static obstacles or of the robot with itself, or None.
         limit_use: Largest share of each limit that the motion uses, by ``position``, ``velocity``, ``acceleration`` and
             ``jerk``.
-        clearance: Lower bound of the least distance to obstacles that move, over all samples, by the sphere cover
-            [m]: it is negative where only the spheres touch, and infinite where there is no such obstacle.
-        clearance_time: When that is [s], NaN without one.
+        clearance: Lower bound of the least distance to dynamic obstacles, over all samples, by the sphere cover [m]:
+            negative where only the spheres overlap, and infinite where there is no such obstacle.
+        clearance_time: Time of that distance [s], NaN without an obstacle.
         at_rest: Whether the motion ends at rest.
         at_goal: Whether it ends at a goal.
     """
@@ -91,14 +90,14 @@ class RefereeReport:
 
     @property
     def exceeded(self) -> dict[str, float]:
-        """The limits that are exceeded, with the shares that are used."""
+        """Shares of the exceeded limits, by name."""
         return {name: share for name, share in self.limit_use.items() if share > 1.0 + LIMIT_TOLERANCE}
 
     @property
     def outcome(self) -> Outcome | None:
-        """The outcome: that of the contacts, else LIMITS or REACHED; None where only the goal was not reached.
+        """The outcome by contacts, else LIMITS or REACHED; None where only the goal was not reached.
 
-        It is HIT_MOVING where the robot moved in any contact with an obstacle, be it later than the first one.
+        It is HIT_MOVING where the robot moved in any contact with an obstacle, not only in the first one.
         """
         hits = [hit for hit in (self.contact, self.still_contact) if hit is not None]
         first = min(hits, key=lambda hit: hit.time, default=None)
@@ -112,7 +111,7 @@ class RefereeReport:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """All that speaks against the run, a sentence each, contacts by time."""
+        """All faults of the run, a sentence each, contacts by time."""
         hits = {hit for hit in (self.contact, self.moving_contact, self.still_contact) if hit is not None}
         over = ", ".join(f"{name} {share:.4g}" for name, share in self.exceeded.items())
         return (
@@ -127,16 +126,16 @@ def judge(
     robot: Robot, problem: Problem, trajectory: Trajectory, *, end: float | None = None,
     goals: ArrayLike | None = None, limits: Limits | None = None, dynamic: Iterable[str] = (),
 ) -> RefereeReport:  # fmt: skip
-    """Find out what truly happened in a run.
+    """Judge the executed motion of a run by the true motions of the obstacles.
 
     Args:
         robot: The robot.
-        problem: The problem, with the scripts of the obstacles that moved.
-        trajectory: The executed motion from time 0 on; behind its end the robot stands.
+        problem: The problem, with the scripts of the moving obstacles.
+        trajectory: The executed motion from time 0 on; after its end the robot is at rest.
         end: When the run ended [s], by default with the motion.
         goals: States of which the motion is to end in one, shape (N, dof); by default the goal of the problem.
         limits: Limits that are to be kept, by default the robot's.
-        dynamic: Names of obstacles that count as moving, though they stood all the time.
+        dynamic: Names of obstacles that count as moving, though they were at rest all the time.
 
     Raises:
         ParameterError: The motion is one of other joints, ``end`` is before its end, or the goals have another shape.
@@ -171,10 +170,10 @@ def judge(
 
 
 class ExactDynamicObstacles:
-    """The exact shapes of a robot, of what it holds and of obstacles that move."""
+    """Exact shapes of a robot, its held objects and dynamic obstacles."""
 
     def __init__(self, robot: Robot, problem: Problem, scripted: ScriptedDynamicObstacles) -> None:
-        """Take the robot, the problem for what is held and may touch, and the obstacles."""
+        """Take the robot, the problem with its held objects and allowed pairs, and the obstacles."""
         self._robot, self._scripted = robot, scripted
         self._obstacles: dict[str, Obstacle] = {o.name: o for o in scripted.obstacles}
         bodies = SceneBodies(robot)
@@ -192,7 +191,7 @@ class ExactDynamicObstacles:
 
         Args:
             motion: The motion.
-            times: Times that are looked at, shape (N,), increasing from 0 [s].
+            times: Times of the samples, shape (N,), increasing from 0 [s].
         """
         first = None
         for time, there in self._near(motion, times):
@@ -205,26 +204,26 @@ class ExactDynamicObstacles:
         return first, None
 
     def _near(self, motion: Trajectory, times: Array) -> Iterator[tuple[float, tuple[str, ...]]]:
-        """Yield the times at which the sphere covers do not prove the robot apart, with names of what is there."""
+        """Yield the times at which the sphere covers do not prove the robot clear, with the names of the obstacles."""
         kernel = self._scripted.kernel
         for piece in self._scripted.pieces(float(times[-1])):
-            if piece.begin == piece.end:  # a moment, of which there is nothing to prove
+            if piece.start == piece.end:  # a single moment
                 yield from self._among(motion, times, piece)
                 return
-            time, last = piece.begin, -np.inf
+            time, last = piece.start, -np.inf
             while len(piece.dynamic):
                 conflict = prove_motion(kernel, piece.dynamic, motion, time, piece.end)
                 if not conflict:
                     break
                 time = min(conflict.time + STRETCH, piece.end)
-                begin = max(conflict.time - SPACING, piece.begin)
-                yield from self._among(motion, times[(times >= begin) & (times > last) & (times <= time)], piece)
+                start = max(conflict.time - SPACING, piece.start)
+                yield from self._among(motion, times[(times >= start) & (times > last) & (times <= time)], piece)
                 last = time
                 if time >= piece.end:
                     break
 
     def contact_at(self, motion: Trajectory, time: float, there: tuple[str, ...]) -> RunContact | None:
-        """Return the deepest contact with one of the obstacles that are there at a time [s], or None."""
+        """Return the deepest contact with one of the obstacles that exist at a time [s], or None."""
         order = self._robot.to_pinocchio(motion(time))
         if not np.isfinite(order).all():  # a hand outside its limits, which is a fault by itself
             return None
@@ -239,7 +238,7 @@ class ExactDynamicObstacles:
         return RunContact(time, deepest.first, deepest.second, deepest.depth, not is_at_rest(motion, time))
 
     def _among(self, motion: Trajectory, times: Array, piece: Piece) -> Iterator[tuple[float, tuple[str, ...]]]:
-        """Yield the times inside of a piece at which the sphere covers do not prove the robot apart."""
+        """Yield the times of a piece at which the sphere covers do not prove the robot clear."""
         if len(piece.dynamic) and len(times):
             spheres = clearance_in_time(self._scripted.kernel, piece.dynamic, motion(times), times, NEAR)[0]
             there = piece.dynamic.names
@@ -249,10 +248,10 @@ class ExactDynamicObstacles:
 def still_contact(checker: CollisionChecker, motion: Trajectory, times: Array) -> RunContact | None:
     """Return the first contact of a motion with the scene of a checker or of the robot with itself, or None.
 
-    The motion is proved along its cubic pieces; only where that fails the first sample in contact is looked for.
+    The motion is checked continuously along its cubic pieces; the first sample in contact is sought where that fails.
 
     Args:
-        checker: The robot among what stands still.
+        checker: The robot among static obstacles.
         motion: The motion.
         times: Times of the samples, shape (N,), increasing [s].
     """

@@ -45,9 +45,9 @@ class Outcome(StrEnum):
 
     REACHED = "reached"
     HIT_MOVING = "hit-moving"  # a contact while the robot moved
-    HIT_AT_REST = "hit-at-rest"  # an obstacle came to the robot that stood
-    HIT_STILL = "hit-still"  # a contact with what stands still, or with itself
-    STUCK = "stuck"  # no motion for longer than is allowed
+    HIT_AT_REST = "hit-at-rest"  # an obstacle touched the robot at rest
+    HIT_STILL = "hit-still"  # a contact with a static obstacle, or of the robot with itself
+    STUCK = "stuck"  # no motion for longer than allowed
     TIMEOUT = "timeout"
     ABORTED = "aborted"  # the sensor failed, or the user interrupted it
     LIMITS = "limits"  # of position, velocity, acceleration or jerk
@@ -63,7 +63,7 @@ class Event:
         time: When [s].
         kind: ``observation refused``, ``place doubted``, ``blind``, ``conflict``, ``stop``, ``request``, ``accepted``,
             ``rejected``, ``reaction``, ``goal``, ``broken assumption`` or ``contact``.
-        data: What there is to say of it: texts and numbers, JSON's.
+        data: Details, as JSON: texts and numbers.
     """
 
     time: float
@@ -80,18 +80,18 @@ class RunResult:
     Attributes:
         outcome: How it ended.
         reason: One sentence: which bodies touched, when, how deep; empty where the goal was reached.
-        problem: The problem; obstacles that moved have the ``trajectory`` that they took, and ``appears``.
+        problem: The problem; moving obstacles have the ``trajectory`` that they took, and ``appears``.
         robot: Name of the robot.
-        method: Name of the way of replanning.
+        method: Name of the replanner.
         prediction: How obstacles were predicted.
         clock: ``sim`` or ``real``.
         seed: The seed used.
-        trajectory: What the robot did, from time 0 on.
+        trajectory: The executed motion, from time 0 on.
         events: What happened, by time.
         metrics: Numbers by name: ``time_to_goal`` [s], ``rest_time`` [s], ``stops``, ``replans_asked``,
             ``replans_accepted``, ``clearance`` [m], ``reaction_p95`` [s], ``broken_steps``, ``unguarded_steps``, ...
-        settings: Those of the loop and of the sensor, and the version of the table of costs; JSON's.
-        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.model.digest`; empty where it is not known.
+        settings: Settings of the loop and of the sensor, and the version of the compute-cost table, as JSON.
+        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.model.digest`; empty where it is unknown.
     """
 
     outcome: Outcome
@@ -113,7 +113,7 @@ class RunResult:
         return self.outcome is Outcome.REACHED
 
     def __repr__(self) -> str:
-        """Return the outcome, the method and the world, in one line."""
+        """Return the outcome, the method and the problem, in one line."""
         motion, clock = f"motion {self.trajectory.duration:.2f} s", f"{self.clock} clock"
         head = f"{self.outcome} by {self.method}"
         return one_line("RunResult", head, repr(self.problem.name), motion, clock, self.reason)
@@ -207,7 +207,7 @@ def _summary(result: RunResult) -> Summary:
 
 
 def _check_plain(data: Mapping[str, Any]) -> None:
-    """Check that metrics, settings and events are JSON's, without numbers that are not finite."""
+    """Check that metrics, settings and events are JSON with finite numbers."""
     for name in ("metrics", "settings", "events"):
         try:
             json.dumps(data[name], allow_nan=False)
@@ -216,7 +216,7 @@ def _check_plain(data: Mapping[str, Any]) -> None:
 
 
 def _parsed(data: Mapping[str, Any], source: str) -> RunResult:
-    """Return a run of the content of a file; what does not fit raises."""
+    """Return the run in the content of a file; an error names what does not fit."""
     _check_plain(data)
     knots = {key: finite_array(data["trajectory"][key], f"trajectory.{key}") for key in KNOTS}
     texts = {name: _typed(data[name], str, name) for name in (*TEXTS, "robot_digest")}
@@ -236,7 +236,7 @@ def _parsed(data: Mapping[str, Any], source: str) -> RunResult:
     start: Array = found.problem.start_state(found.trajectory.joint_names)
     off = float(np.abs(found.trajectory.positions[0] - start).max())
     if off > START_TOLERANCE:
-        raise ParameterError("trajectory", f"a begin {off:.3g} rad away from it", "a motion from the problem's start")
+        raise ParameterError("trajectory", f"a start {off:.3g} rad away from it", "a motion from the problem's start")
     return found
 
 
@@ -247,7 +247,7 @@ def _event(row: Mapping[str, Any], name: str) -> Event:
 
 
 def _typed(value: Any, kind: type, name: str) -> Any:
-    """Return a value of a type of JSON."""
+    """Return a value, which must be of a JSON type."""
     if not isinstance(value, kind):
         raise ParameterError(name, value, f"a {JSON_NAMES[kind.__name__]}")
     return value

@@ -1,6 +1,6 @@
-"""Estimates of obstacles that move: Kalman filters of constant velocity, and where obstacles may be.
+"""Estimates of dynamic obstacles: Kalman filters of constant velocity, and reachable sets.
 
-Each obstacle has a filter of its own whose state is place and velocity, with white noise of the acceleration
+Each obstacle has a filter of its own whose state is position and velocity, with white noise of the acceleration
 (Bar-Shalom, Li and Kirubarajan 2001, section 6.2.2). The axes are alike, so that one covariance serves all three.
 """
 
@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.loop.observation import Observation
+from apex_ompl.loop.environment import Observation
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
 from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array
 
-LOOKS = 16  # at an obstacle that are kept
+LOOKS = 16  # observations of an obstacle that are kept
 MOST_TRACKS = 64  # obstacles that are tracked at a time
-MOST_DOUBTED = 8  # places of one obstacle that contradict each other and are all kept
-GAP = 0.1  # longest time between two looks that counts as watched all through [s]
-GATE = 16.0  # squared Mahalanobis distance, of three axes, behind which an obstacle has turned
+MOST_DOUBTED = 8  # contradicting places of one obstacle that are all kept
+GAP = 0.1  # longest time between two observations that counts as observed [s]
+GATE = 16.0  # squared Mahalanobis distance, of three axes, after which an obstacle has turned
 AXES = 3
-LEAST = 0.002  # clearance to margins that a robot has where it stands [m]
+LEAST = 0.002  # clearance beyond the margins that a robot has where it is at rest [m]
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,12 @@ class TrackSettings:
     """Parameters of the filters.
 
     Attributes:
-        noise: Standard deviation of an observed place on each axis [m].
-        power: Power of the noise of the acceleration [m^2/s^3].
+        noise: Standard deviation of an observed position on each axis [m].
+        power: Power spectral density of the noise of the acceleration [m^2/s^3].
         speed: Standard deviation of the velocity on each axis of an obstacle that is new or has turned [m/s].
-        widths: Standard deviations of the place by which obstacles count as larger.
-        speed_widths: Standard deviations of the velocity by which they grow behind the present.
-        most: Largest such growth [m/s].
+        widths: Margin of obstacles, in standard deviations of the position.
+        speed_widths: Growth of the margin after the present, in standard deviations of the velocity.
+        most: Largest growth of the margin [m/s].
     """
 
     noise: float = 0.008
@@ -56,13 +56,13 @@ class Track:
 
     Attributes:
         shape: The obstacle where it was seen last.
-        stamp: When [s].
-        place: Estimate of the place then, shape (3,) [m].
-        velocity: Shape (3,) [m/s].
-        covariance: Of place and velocity on each axis, shape (2, 2).
+        stamp: Time of that observation [s].
+        place: Estimated position then, shape (3,) [m].
+        velocity: Estimated velocity, shape (3,) [m/s].
+        covariance: Covariance of position and velocity on each axis, shape (2, 2).
         seen: Number of observations since it was new or turned.
-        unseen: Time for which it was looked for and not seen since it was seen last [s].
-        looks: Places where it was seen as it is now, the oldest first, rows of a stamp [s] and a place [m].
+        unseen: Time for which the sensor looked and did not see it since the last observation [s].
+        looks: Observed positions with its shape of now, the oldest first, rows of a stamp [s] and a position [m].
     """
 
     shape: Obstacle
@@ -76,13 +76,13 @@ class Track:
 
     @classmethod
     def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings) -> Track:
-        """Begin with an observation."""
+        """Start with an observation."""
         spread = np.diag([settings.noise**2, settings.speed**2])
         looks = [(stamp, *seen.position)]
         return cls(seen, stamp, np.array(seen.position, float), np.zeros(AXES), spread, looks=looks)
 
     def update(self, seen: Obstacle, stamp: float, settings: TrackSettings) -> bool:
-        """Take a later observation; return False where the obstacle has turned, and the velocity begins anew."""
+        """Take a later observation; return False where the obstacle has turned, and the filter is reset."""
         dt, noise = stamp - self.stamp, settings.noise**2 + 1e-12
         forward = np.array([[1.0, dt], [0.0, 1.0]])
         drift = settings.power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
@@ -91,7 +91,7 @@ class Track:
         spread = expected[0, 0] + noise
         before = (
             self.looks[1 - LOOKS :] if same_solid(seen, self.shape) else []
-        )  # a ball around another shape says nothing
+        )  # a position of another shape does not bound this one
         self.shape, self.stamp, self.unseen, self.looks = seen, stamp, 0.0, [*before, (stamp, *seen.position)]
         if miss @ miss > GATE * spread:
             fresh = Track.new(seen, stamp, settings)
@@ -105,13 +105,13 @@ class Track:
         return True
 
     def growth(self, settings: TrackSettings) -> tuple[float, float]:
-        """Return by how much the obstacle counts as larger at the stamp [m], and behind it [m/s]."""
+        """Return the margin of the obstacle at the stamp [m], and its growth after that [m/s]."""
         place, speed = (math.sqrt(max(v, 0.0)) for v in np.diag(self.covariance))
         return settings.widths * place, min(settings.speed_widths * speed, settings.most)
 
 
 class Taken(NamedTuple):
-    """What came of an observation.
+    """How an observation was taken.
 
     Attributes:
         refused: Why it was refused as a whole, or nothing.
@@ -124,10 +124,10 @@ class Taken(NamedTuple):
 
 @dataclass(eq=False)
 class Tracker:
-    """What the loop knows of obstacles that move.
+    """Estimates of all dynamic obstacles.
 
-    A place that an obstacle cannot have come to since it was seen last contradicts an assumption: the obstacle may be
-    where it is seen now, or the look was wrong. Both count as where it can be, until a later look tells.
+    A place that an obstacle cannot have reached since the last observation contradicts an assumption: either
+    observation may be wrong. Both places count as possible, until a later observation confirms one of them.
 
     Attributes:
         kernel: The robot's kernel, for pairs of bodies that may touch.
@@ -135,11 +135,11 @@ class Tracker:
         allowed: Pairs of names of bodies that may touch.
         error: Largest error of an observed place [m].
         fastest: Largest speed of any obstacle [m/s].
-        memory: Time after which an obstacle is forgotten that was looked for and not seen [s].
-        awaited: Names of the obstacles that are known to be there and were not seen yet.
+        memory: Time of unseen after which an obstacle is forgotten [s].
+        awaited: Names of the initial obstacles that were not seen yet.
         tracks: Estimates by name.
         doubted: Other estimates of obstacles, which contradict those of ``tracks``.
-        last: The newest stamp of a look of use [s].
+        last: The newest stamp of a usable observation [s].
     """
 
     kernel: Kernel
@@ -156,14 +156,14 @@ class Tracker:
     _shapes: list[Obstacle] = field(default_factory=list, init=False)
 
     def take(self, observation: Observation, now: float = math.inf) -> Taken:
-        """Take an observation, by its stamp and not by its arrival; what is older than what is known says nothing.
+        """Take an observation, by its stamp and not by its arrival; older ones than the last change nothing.
 
-        An observation that cannot be true is refused as a whole, so that what is known ages. One with places that
-        contradict what is known is taken.
+        An observation that cannot be true is refused as a whole, so that earlier ones age. One whose places contradict
+        earlier ones is taken.
 
         Args:
             observation: The observation.
-            now: Time of the clock [s].
+            now: Clock time [s].
         """
         fault = self._fault(observation, now)
         if fault:
@@ -201,7 +201,7 @@ class Tracker:
         return ""
 
     def _take_place(self, track: Track, seen: Obstacle, stamp: float) -> bool:
-        """Take a later place of an obstacle; return whether it agrees with what was known."""
+        """Take a later place of an obstacle; return whether it agrees with earlier ones."""
         others = [one for one in self.doubted if one.shape.name == seen.name]
         known = next((one for one in (track, *others) if self.may_be(one, seen, stamp)), None)
         if known is not None:
@@ -216,23 +216,23 @@ class Tracker:
         return False
 
     def may_be(self, track: Track, seen: Obstacle, stamp: float, errors: int = 2) -> bool:
-        """Whether an obstacle that was where a track says can be where it is seen at a later time [s].
+        """Whether an obstacle can have moved from the place of a track to where it is seen at a later time [s].
 
         Args:
             track: The track.
             seen: The obstacle.
             stamp: The time [s].
-            errors: How many of both places are observed.
+            errors: How many of the two places are observed, with an error.
         """
         way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
         return way <= errors * self.error + self.fastest * (stamp - track.stamp) + 1e-9
 
     def _forget(self, seen: set[str], watched: float) -> None:
-        """Forget obstacles that were not seen for as long as one is not unseen.
+        """Forget obstacles that were not seen for ``memory``.
 
         Args:
             seen: Names of those that were seen now.
-            watched: Time since the last look [s].
+            watched: Time since the last observation [s].
         """
         for track in (*self.tracks.values(), *self.doubted):
             track.unseen += watched if track.shape.name not in seen else 0.0
@@ -240,20 +240,20 @@ class Tracker:
         self.doubted = [track for track in self.doubted if track.unseen <= self.memory]
 
     def predicted(self, margin: float, prediction: str = "cv") -> DynamicObstacles:
-        """Return the obstacles as they are expected to move, larger by a margin [m] and by what is uncertain."""
+        """Return the predicted obstacles, larger by a margin [m] and by their uncertainty."""
         if prediction == "still":
             return self._as_seen(margin, 0.0)
         some = self.tracks.values()
         growth = [(margin + first, later) for first, later in (track.growth(self.settings) for track in some)]
         return self._placed([track.place for track in some], [track.velocity for track in some], growth)
 
-    def eased(self, dynamic: DynamicObstacles, q: Array, times: ArrayLike) -> DynamicObstacles:
-        """Take so much of the margins away that the robot may stand where it is, in place, and return the obstacles.
+    def ease_margins(self, dynamic: DynamicObstacles, q: Array, times: ArrayLike) -> DynamicObstacles:
+        """Reduce the margins, in place, as far as the robot needs to rest where it is, and return the obstacles.
 
         Args:
             dynamic: Obstacles with margins.
             q: The robot's state, shape (dof,).
-            times: Times of the clock at which it may stand there [s].
+            times: Clock times at which it rests there [s].
         """
         at = np.atleast_1d(np.asarray(times, float))
         clear, _ = clearance_in_time(self.kernel, dynamic, np.repeat(q[None], len(at), axis=0), at, 2.0 * LEAST)
@@ -263,11 +263,11 @@ class Tracker:
         return dynamic
 
     def reachable(self, error: float, fastest: float, margin: float = 0.0, q: Array | None = None) -> DynamicObstacles:
-        """Return the obstacles as large as all that they can reach: seen within an error [m], no faster than [m/s].
+        """Return the reachable sets of the obstacles: seen within an error [m], and no faster than a speed [m/s].
 
-        Every look bounds where an obstacle is by a ball that grows; what counts is the one that leaves a robot at a
-        state, shape (dof,), most room. Where looks contradict each other, an obstacle can be at each of the places,
-        which are obstacles of their own here.
+        Each observation bounds the place of an obstacle by a ball that grows with time. The ball that leaves a robot at
+        a state, shape (dof,), most room counts. Where observations contradict each other, an obstacle can be at each of
+        the places, which are obstacles of their own here.
         """
         tracks = (*self.tracks.values(), *self.doubted)
         if not tracks:
@@ -282,7 +282,7 @@ class Tracker:
         return DynamicObstacles(shapes, pairs).placed(looks[:, 1:], still, growth, looks[:, 0])
 
     def _best_look(self, track: Track, fastest: float, q: Array) -> Array:
-        """Return the look whose ball leaves a robot at a state most room, by the nearest ball of its cover."""
+        """Return the observation whose ball leaves a robot at a state most room, by the nearest ball of its cover."""
         looks = np.array(track.looks)
         centers, radii = self._balls(q)
         nearest = centers[np.argmin(np.linalg.norm(centers - looks[-1, 1:], axis=1) - radii)]
@@ -303,7 +303,7 @@ class Tracker:
         return allowed_rows(self.kernel, self.allowed, [name])
 
     def _as_seen(self, margin: float, growth: float) -> DynamicObstacles:
-        """Return the obstacles where they were seen last, with a margin [m] that grows [m/s]."""
+        """Return the obstacles where they were seen last, with a margin [m] and its growth [m/s]."""
         places = [track.shape.position for track in self.tracks.values()]
         return self._placed(places, [(0.0, 0.0, 0.0)] * len(places), [(margin, growth)] * len(places))
 
@@ -317,7 +317,7 @@ class Tracker:
         return made.placed(at, along, np.array(growth, float).reshape(-1, 2), stamps)
 
     def _dynamic(self) -> DynamicObstacles:
-        """Return the obstacles, made anew where a shape changed."""
+        """Return the obstacles; they are built again where a shape changed."""
         shapes, made = [track.shape for track in self.tracks.values()], self._made
         if made is None or len(shapes) != len(self._shapes) or not all(map(same_solid, shapes, self._shapes)):
             made = self._made = DynamicObstacles(
@@ -327,9 +327,9 @@ class Tracker:
         return made
 
 
-def as_they_are(
+def true_motions(
     kernel: Kernel, present: Iterable[Obstacle], time: float, allowed: Iterable[tuple[str, str]]
 ) -> DynamicObstacles:
-    """Return obstacles as they truly move now, from a time on [s]."""
+    """Return obstacles with their true motions from a time on [s]."""
     some = list(present)
     return DynamicObstacles(some, allowed_rows(kernel, allowed, [o.name for o in some]), stamp=time)

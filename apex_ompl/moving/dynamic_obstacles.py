@@ -1,9 +1,9 @@
-"""Obstacles that move, beside the scene: proofs of timed motions among them, and clearances in time."""
+"""Dynamic obstacles: continuous collision checks of timed motions among them, and clearances in time."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -20,6 +20,7 @@ from apex_ompl.kernel.arrays import DynamicArrays, pack, unpack
 from apex_ompl.kernel.moving import clearances_in_time, first_conflict
 from apex_ompl.kernel.scene_builder import Solids, grid_columns, joined
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.scripts import is_there, obstacle_at, place_at, script_times, velocity_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
@@ -31,15 +32,15 @@ PREPARED = 64  # motions whose curves are kept
 
 
 class DynamicObstacles:
-    """Obstacles that move at constant velocity without turning, outside of the scene that a kernel has.
+    """Dynamic obstacles at constant velocity without rotation, beside the scene of a kernel.
 
-    Each has a place and a velocity at a time stamp, and a margin by which it counts as larger, which may grow behind
-    the time stamp. An update is a write to an array.
+    Each has a position and a velocity at a time stamp, and a margin by which it counts as larger, which may grow after
+    the time stamp. An update writes to arrays.
 
     Attributes:
         names: Names of the obstacles.
-        arrays: The solids that they are made of, views of ``packed``.
-        packed: What compiled code takes.
+        arrays: Their solids, views of ``packed``.
+        packed: The same arrays as compiled code takes them.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class DynamicObstacles:
         Meshes, points, voxels and grids of distances move as grids of distances.
 
         Args:
-            obstacles: The obstacles; those without a velocity stand still.
+            obstacles: The obstacles; those without a velocity are at rest.
             allowed: Bodies, as rows of the robot's tables, and names of dynamic obstacles that they may touch.
             stamp: Time of the places [s].
 
@@ -95,7 +96,7 @@ class DynamicObstacles:
         return {name: value for name, value in self.__dict__.items() if name != "arrays"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take a state, and make the views anew."""
+        """Restore a state, and the views of its arrays."""
         self.__dict__.update(state)
         self._pack(self.packed)
 
@@ -111,14 +112,14 @@ class DynamicObstacles:
         self, name: str, position: ArrayLike | None = None, velocity: ArrayLike | None = None,
         *, stamp: float | None = None, growth: tuple[float, float] | None = None,
     ) -> None:  # fmt: skip
-        """Write what is known of an obstacle now; what is not given stays.
+        """Update an obstacle; what is not given stays.
 
         Args:
             name: Its name.
-            position: Where it was at the time stamp, shape (3,) [m].
+            position: Position at the time stamp, shape (3,) [m].
             velocity: Shape (3,) [m/s].
             stamp: Time stamp [s].
-            growth: Margin at the time stamp [m], and its growth behind it [m/s]; neither is negative.
+            growth: Margin at the time stamp [m], and its growth after it [m/s]; neither is negative.
 
         Raises:
             UnknownNameError: There is no such obstacle.
@@ -142,12 +143,12 @@ class DynamicObstacles:
             self.arrays.stamp[mine] = stamp
 
     def placed(self, positions: Array, velocities: Array, growth: Array, stamps: Array) -> DynamicObstacles:
-        """Return a copy in which all that is known of the obstacles is written, as by :meth:`update` but unchecked.
+        """Return a copy with other positions, velocities and margins, unchecked.
 
         Args:
-            positions: Where they were at the time stamps, shape (N, 3) [m].
+            positions: Positions at the time stamps, shape (N, 3) [m].
             velocities: Shape (N, 3) [m/s].
-            growth: Margins at the time stamps [m], and their growth behind them [m/s], shape (N, 2).
+            growth: Margins at the time stamps [m], and their growth after them [m/s], shape (N, 2).
             stamps: Time stamps, shape (N,) [s].
         """
         other = self.larger(0.0)
@@ -170,13 +171,13 @@ class DynamicObstacles:
         return other
 
     def nominal(self, margin: float) -> DynamicObstacles:
-        """Return a copy whose margins are at most so large [m], and do not grow."""
+        """Return a copy whose margins are at most a distance [m], and do not grow."""
         other = self.with_margin(margin)
         other.arrays.growth[:, 0] = np.minimum(self.arrays.growth[:, 0], margin)
         return other
 
     def at(self, time: float) -> dict[str, Array]:
-        """Return where the obstacles are at a time [s]: positions, shape (3,) [m], by name."""
+        """Return the positions of the obstacles at a time [s], shape (3,) [m], by name."""
         a, found = self.arrays, {}
         for row, name in enumerate(self.names):
             k = int(np.argmax(a.owner == row))
@@ -190,13 +191,13 @@ class DynamicObstacles:
 
 
 class Conflict(NamedTuple):
-    """Where a motion can no longer be proved.
+    """The first moment at which a motion is not proved clear.
 
     Attributes:
-        time: First moment that cannot be proved [s from the motion's begin]; infinite where all of it is proved.
-        body: Name of the body that is not proved apart there, empty where there is none.
-        dynamic obstacle: Name of the dynamic obstacle.
-        intervals: Number of intervals of time looked at.
+        time: First moment that cannot be proved [s from the motion's start]; infinite where all of it is proved.
+        body: Name of the body that is not proved clear there, empty where there is none.
+        dynamic_obstacle: Name of the dynamic obstacle.
+        intervals: Number of intervals of time that were checked.
     """
 
     time: float
@@ -211,28 +212,28 @@ class Conflict(NamedTuple):
 
 @lru_cache(maxsize=PREPARED)
 def curve_of(motion: Trajectory) -> Curve:
-    """Return the cubic pieces of a motion as proofs take them; those of the last motions are kept."""
+    """Return the cubic pieces of a motion for collision checks; those of the last motions are cached."""
     return Curve.cubic(motion.times, motion.positions, motion.velocities, motion.accelerations)
 
 
 def prove_motion(
-    kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, begin: float = 0.0, end: float | None = None,
+    kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, start: float = 0.0, end: float | None = None,
     *, clock: float = 0.0, shortest: float = SHORTEST,
 ) -> Conflict:  # fmt: skip
-    """Prove that a timed motion stays apart from obstacles that move, and find the first moment that is not proved.
+    """Check a timed motion continuously among dynamic obstacles, and find the first moment that is not proved clear.
 
-    The proof is that of the sphere covers along the motion's own cubic pieces
-    (:func:`apex_ompl.kernel.moving.first_conflict`): it is sound, and may leave contacts of some millimeters open
-    that there are not. The scene of the kernel and the robot itself are not looked at.
+    The check is that of the sphere covers along the motion's own cubic pieces
+    (:func:`apex_ompl.kernel.moving.first_conflict`): it is sound and conservative by some millimeters. The scene of the
+    kernel and self-collision are not checked.
 
     Args:
-        kernel: The kernel of the robot with what it holds.
+        kernel: The kernel of the robot with its held objects.
         dynamic: The obstacles.
-        motion: The motion; behind its end the robot stands.
-        begin: Where on the motion to begin [s].
-        end: Where to end [s], by default at its end.
+        motion: The motion; after its end the robot is at rest.
+        start: Time of the motion at which the check starts [s].
+        end: Time of the motion at which it ends [s], by default its duration.
         clock: Time of the dynamic obstacles' stamps when the motion is at 0 [s].
-        shortest: Length of an interval of time that is given up [s].
+        shortest: Length of an interval of time that is not divided further [s].
 
     Raises:
         ParameterError: The motion is one of other joints, or a number is not finite.
@@ -240,10 +241,10 @@ def prove_motion(
     if motion.dof != kernel.robot.dof:
         raise ParameterError("motion", motion.dof, f"one of {kernel.robot.dof} joints")
     until = motion.duration if end is None else end
-    for name, value in (("begin", begin), ("end", until), ("clock", clock)):
+    for name, value in (("start", start), ("end", until), ("clock", clock)):
         check_number(value, name)
     time, body, row, intervals = first_conflict(
-        kernel, dynamic.packed, curve_of(motion), begin, until, clock, shortest
+        kernel, dynamic.packed, curve_of(motion), start, until, clock, shortest
     )  # fmt: skip
     found = body >= 0 and math.isfinite(time)
     names = (kernel.robot.body_names[body], dynamic.names[row]) if found else ("", "")
@@ -256,11 +257,11 @@ def clearance_in_time(
     """Return the signed clearances of a robot's sphere cover to dynamic obstacles, and their gradients.
 
     Args:
-        kernel: The kernel of the robot with what it holds.
+        kernel: The kernel of the robot with its held objects.
         dynamic: The obstacles.
         states: States, shape (N, dof).
         times: Times of the dynamic obstacles' stamps, shape (N,) [s].
-        limit: Larger clearances are given as this [m]; a small one is faster.
+        limit: Larger clearances are returned as this [m]; a small one is faster.
 
     Returns:
         Values, shape (N,) [m], NaN where a state is not finite or a hand is outside its limits, margins subtracted;
@@ -282,3 +283,73 @@ def allowed_rows(kernel: Kernel, allowed: Iterable[tuple[str, str]], names: Sequ
             if dynamic_obstacle in names:
                 rows += [(k, dynamic_obstacle) for k, name in enumerate(kernel.robot.body_names) if name == body]
     return rows
+
+
+class Piece(NamedTuple):
+    """A piece of time in which all obstacles move at constant velocity.
+
+    Attributes:
+        start: Start of the piece [s].
+        end: End of the piece [s].
+        dynamic: The obstacles that exist then, with ``start`` as their stamp; valid until the next piece is taken.
+    """
+
+    start: float
+    end: float
+    dynamic: DynamicObstacles
+
+
+class ScriptedDynamicObstacles:
+    """Dynamic obstacles with scripts, beside the scene of a kernel.
+
+    Attributes:
+        kernel: The kernel of the robot with its held objects.
+        obstacles: The obstacles with their scripts.
+    """
+
+    def __init__(self, kernel: Kernel, obstacles: Iterable[Obstacle], allowed: Sequence[tuple[str, str]] = ()) -> None:
+        """Take obstacles, and pairs of names of bodies that may touch.
+
+        Raises:
+            SceneError, ParameterError: As :class:`apex_ompl.moving.dynamic_obstacles.DynamicObstacles`.
+        """
+        self.kernel, self.obstacles, self._allowed = kernel, tuple(obstacles), tuple(allowed)
+        self._known: dict[tuple[str, ...], DynamicObstacles] = {}
+        self._dynamic(self.obstacles, 0.0)
+
+    def pieces(self, end: float) -> Iterator[Piece]:
+        """Yield the pieces of the time from 0 to ``end`` [s] in turn; a single one without length where that is 0."""
+        inner = {time for o in self.obstacles for time in script_times(o) if 0.0 < time < end}
+        edges = [0.0, *sorted(inner), end]
+        for start, until in zip(edges[:-1], edges[1:], strict=True):
+            here = [o for o in self.obstacles if is_there(o, start)]
+            yield Piece(start, until, self._dynamic(here, start))
+
+    def clearances(self, motion: Trajectory, times: Array) -> Array:
+        """Return lower bounds of a motion's distance to the obstacles at some times, shape (N,) [m].
+
+        They are distances of the sphere cover, which contains the robot; infinite where there is no obstacle, NaN where
+        a hand is outside its limits.
+
+        Args:
+            motion: The motion; after its end the robot is at rest.
+            times: Shape (N,), increasing from 0 or more [s].
+        """
+        found = np.full(len(times), np.inf)
+        for start, end, dynamic in self.pieces(float(times[-1]) if len(times) else 0.0):
+            rows = np.flatnonzero((times >= start) & (times <= end))
+            if len(dynamic) and len(rows):
+                at = times[rows]
+                found[rows] = clearance_in_time(self.kernel, dynamic, motion(at), at)[0]
+        return found
+
+    def _dynamic(self, here: Sequence[Obstacle], time: float) -> DynamicObstacles:
+        """Return obstacles with their motion from a time on [s]."""
+        names = tuple(o.name for o in here)
+        if names not in self._known:
+            rows = allowed_rows(self.kernel, self._allowed, names)
+            self._known[names] = DynamicObstacles([obstacle_at(o, time) for o in here], rows)
+        dynamic = self._known[names]
+        for o in here:
+            dynamic.update(o.name, place_at(o, time), velocity_at(o, time), stamp=time)
+        return dynamic

@@ -12,13 +12,13 @@ PREDICTIONS = ("still", "cv", "truth")
 """How obstacles are predicted: where they were seen (the paper), at constant velocity, or as they truly move."""
 
 EVADE = ("never", "proved", "risk")
-"""What a robot at rest does that an obstacle is about to touch, see :class:`LoopSettings`."""
+"""What a robot at rest does when an obstacle is about to touch it, see :class:`LoopSettings`."""
 
 RANGES = {
     "watched": (0.0, 60.0), "period": (1e-3, 0.1), "budget": (1e-3, 10.0), "hold": (0.0, 10.0),
-    "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "berth": (0.0, 0.5), "error": (0.0, 0.5), "fastest": (0.0, 5.0),
-    "trigger": (0.0, 1.0), "timeout": (0.1, 600.0), "stuck": (0.1, 600.0), "latency": (-1.0, 10.0),
-    "memory": (0.1, 600.0), "silence": (0.01, 60.0),
+    "rest_hold": (0.0, 10.0), "margin": (0.0, 0.1), "clearance_margin": (0.0, 0.5), "error": (0.0, 0.5),
+    "fastest": (0.0, 5.0), "trigger": (0.0, 1.0), "timeout": (0.1, 600.0), "stuck": (0.1, 600.0),
+    "latency": (-1.0, 10.0), "memory": (0.1, 600.0), "silence": (0.01, 60.0),
 }  # fmt: skip
 
 
@@ -27,34 +27,33 @@ class LoopSettings:
     """Parameters of the closed loop.
 
     Attributes:
-        watched: Time for which obstacles were observed before the run begins [s].
-        period: Time between two looks at the world [s].
-        budget: Time that a replan may take; what it finds begins this long after it was asked for [s].
-        latency: Time after which the answer of a replan is known [s]; -1 charges what the replan did by the table of
-            costs.
-        prediction: One of ``PREDICTIONS``: what plans are proved against.
-        guarded: Whether the robot only goes on while a stop behind the next step is proved.
-        evade: What a robot at rest does that an obstacle is about to touch. ``proved``: it steps aside only along a
-            motion that is proved clear of all that obstacles can reach until it is at rest again, so that it is at rest
-            whenever it is touched. ``risk``: also along one that is only predicted to be clear; the steps without a
-            fail-safe stop are counted (``unguarded_steps``). ``never``: it stays.
-        monitored: Whether the motion is looked at again while it is followed; without, it is followed blindly.
+        watched: Time for which obstacles were observed before the run starts [s].
+        period: Time between two steps of the loop [s].
+        budget: Time that a replan may take; its motion starts this long after the request [s].
+        latency: Time after which the answer of a replan is available [s]; -1 takes it from the compute-cost model.
+        prediction: One of ``PREDICTIONS``: the prediction that plans are proved against.
+        guarded: Whether the robot continues only while a stop after the next step is proved.
+        evade: What a robot at rest does when an obstacle is about to touch it. ``proved``: it steps aside only along a
+            motion that is proved clear of all reachable sets until it is at rest again, so that it is at rest whenever
+            it is touched. ``risk``: also along one that is only predicted to be clear; the steps without a fail-safe
+            stop are counted (``unguarded_steps``). ``never``: it stays.
+        monitored: Whether the motion is checked again at every step; otherwise it is followed to its end.
         verified: Whether motions are taken only where they are proved.
-        from_rest: Whether the robot stops where its motion is blocked, and plans anew only where it stands.
+        from_rest: Whether the robot stops where its motion is blocked, and replans only at rest.
         by_distance: Whether a motion counts as blocked where an obstacle is nearer than ``trigger``, instead of where a
-            conflict is predicted; once motion began nearer than that, where one comes nearer still.
+            conflict is predicted; where it started nearer than that, where one comes nearer still.
         trigger: That distance, lambda_obs of the paper's Algorithm 1 [m].
-        hastens: Whether a faster motion is looked for while one without a conflict is followed.
+        hastens: Whether a faster motion is sought while the robot follows one without a conflict.
         hold: Time for which the goal must stay clear from the arrival on [s].
-        rest_hold: Time for which a robot that stands elsewhere looks ahead [s].
-        margin: Distance that is kept from obstacles that move [m].
-        berth: Distance beyond it at which motions are optimized to pass by, where there is room [m].
-        error: Largest error of an observed place, for the guarantee [m]; None is that of the sensor.
-        fastest: Largest speed of any obstacle, for the guarantee [m/s]; None is that of the world.
-        memory: Every obstacle is seen at least this often, for the guarantee [s]: one that was not, while the sensor
-            looked, is forgotten.
-        silence: Time without a look of use after which the robot stops, and does not start [s].
-        timeout: Time after which a run ends [s]; a robot that moves then stops first.
+        rest_hold: Time for which a state of rest elsewhere must stay clear [s].
+        margin: Distance that is kept from dynamic obstacles [m].
+        clearance_margin: Distance beyond it that optimized motions keep where there is room [m].
+        error: Largest error of an observed place, for the guarantee [m]; None takes the sensor's.
+        fastest: Largest speed of any obstacle, for the guarantee [m/s]; None takes the environment's.
+        memory: Longest time between two observations of an obstacle, for the guarantee [s]; one that the sensor does
+            not see for longer is forgotten.
+        silence: Time without a usable observation after which the robot stops, and does not start [s].
+        timeout: Time after which a run ends [s]; a moving robot then stops first.
         stuck: Time of rest after which a run ends [s].
     """
 
@@ -74,7 +73,7 @@ class LoopSettings:
     hold: float = 0.1
     rest_hold: float = 1.5
     margin: float = 0.005
-    berth: float = 0.05
+    clearance_margin: float = 0.05
     error: float | None = None
     fastest: float | None = None
     memory: float = 3.0
@@ -101,7 +100,7 @@ class LoopSettings:
             raise ParameterError("budget", self.budget, f"a multiple of the period, {self.period:g} s")
 
     def completed(self, error: float, fastest: float) -> LoopSettings:
-        """Return them with a largest error [m] and a largest speed [m/s] where these are None."""
+        """Return the settings with a largest error [m] and a largest speed [m/s] where these are None."""
         return replace(
             self, error=error if self.error is None else self.error,
             fastest=fastest if self.fastest is None else self.fastest,
@@ -112,7 +111,7 @@ class LoopSettings:
         """Largest error of an observed place [m], and largest speed of any obstacle [m/s].
 
         Raises:
-            ParameterError: They were not completed.
+            ParameterError: The settings were not completed.
         """
         if self.error is None or self.fastest is None:
             raise ParameterError("settings", "no error or no fastest", "both, as LoopSettings.completed fills in")

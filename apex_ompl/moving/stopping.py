@@ -1,4 +1,4 @@
-"""Stops from any state of motion: along the path of a motion, or joint by joint, and their proofs in advance."""
+"""Stops from any state of motion, along the path of a motion or joint by joint, and their prediction."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import fields_line
 
-DEVIATION = 1e-3  # of a stop from the path [rad]
+DEVIATION = 1e-3  # largest distance of a stop from the path [rad]
 
 
 class Stop(NamedTuple):
     """A motion to rest.
 
     Attributes:
-        trajectory: The motion, from the state that it was asked for.
+        trajectory: The motion, from the given state on.
         beyond: How far it passes the position limits of each joint, shape (dof,) [rad; synergies 0..1]. A joint for
             which this is not 0 has no stop within its limits: the state was not in its stoppable set.
         deviation: Largest distance of any joint from the path along which it stops [rad]; infinity where it stops
@@ -43,19 +43,19 @@ class Stop(NamedTuple):
 
 
 def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity: Array, acceleration: Array) -> Stop:
-    """Return the soonest stop from a state, of each joint by itself.
+    """Return the soonest stop from a state, joint by joint.
 
     It is what Ruckig's velocity interface finds (Berscheid and Kroeger 2021), in closed form:
     :func:`apex_ompl.kernel.moving.stop_joints`. A joint whose soonest stop would pass a position limit brakes for
-    longer, as long as keeps the limit, and swings back. The limits of acceleration and jerk are kept; that of velocity
-    is where it can be, i.e. where |v + a |a| / (2 J)| is within it.
+    longer, so that it keeps the limit, and swings back. The limits of acceleration and jerk are kept; that of velocity
+    is kept where this is possible, i.e. where |v + a |a| / (2 J)| is within it.
 
     Args:
         limits: Limits of the joints.
         joint_names: Their names.
         position: Shape (dof,) [rad; synergies 0..1].
-        velocity: Within the limits, likewise [rad/s].
-        acceleration: Within the limits, likewise [rad/s^2].
+        velocity: Within the limits, shape (dof,) [rad/s].
+        acceleration: Within the limits, shape (dof,) [rad/s^2].
     """
     times, knots, beyond = stop_joints(position, velocity, acceleration, LimitArrays.of(limits))
     return Stop(Trajectory.unchecked(times, knots, joint_names), beyond, np.inf)
@@ -64,7 +64,7 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
 def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float = DEVIATION) -> Stop:
     """Return the soonest stop along the path of a motion, among profiles of slowing down.
 
-    It begins with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
+    It starts with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
     and is the rest of the motion itself where no profile ends sooner (:func:`apex_ompl.kernel.moving.stop_on_path`).
 
     Args:
@@ -87,20 +87,20 @@ def stops_proved(
 ) -> tuple[int, Flags]:  # fmt: skip
     """Return how many of some moments of a motion, from the first on, have a proved stop, and of which kind.
 
-    At each, obstacles were seen a while ago, where they are expected then, and may have gone anywhere since. The next
-    period of the motion is proved clear of that, and the soonest stop along it behind (:func:`stop_along`), or else
-    that of each joint by itself (:func:`stop`), which are flagged, shape (N,). What stands still is not looked at: a
-    stop along the motion stays within a millimeter of it.
+    At a moment, the obstacles were seen some time ago at their predicted places, and their reachable sets have grown
+    since. The next period of the motion is proved clear of these sets, and the soonest stop along the motion after it
+    (:func:`stop_along`), or else the stop joint by joint (:func:`stop`), which is flagged, shape (N,). Static obstacles
+    are not checked: a stop along the motion stays within a millimeter of it.
 
     Args:
-        kernel: The kernel of the robot with what it holds.
-        expected: The obstacles as they are expected to move; their margins do not count.
+        kernel: The kernel of the robot with its held objects.
+        expected: The predicted obstacles; their margins do not count.
         motion: A motion within the limits that ends at rest.
         limits: Limits of stops.
         moments: Times of the motion, shape (N,) [s].
         clock: Time of the obstacles' stamps when the motion is at 0 [s].
         age: How long before a moment they were seen [s].
-        growth: Margin of what was seen [m], and its growth since [m/s].
+        growth: Margin of observed places [m], and its growth since the observation [m/s].
         period: Time from a moment to the stop [s].
     """
     series = StopSeries(

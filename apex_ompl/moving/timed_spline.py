@@ -1,9 +1,12 @@
-"""Optimization in space and time: splines in time among obstacles that move, from a moving start to rest at a goal."""
+"""Optimization in space and time: splines in time among dynamic obstacles, and a pool of candidates.
+
+A motion starts from a moving state and ends at rest at a goal.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -13,6 +16,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.moving import SAMPLE_WIDTH, MotionCost, optimize_motion
 from apex_ompl.kernel.path import CostSettings, PathGrid, PathReport
+from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
@@ -20,11 +24,19 @@ from apex_ompl.timing.spline_method import least_knot_spacing, spline_in_time, s
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive
 
-PINNED = 3  # control points at each end that say where and how a motion begins and ends
-KNOT_SPACING = 0.1  # that is aimed at [s]
+PINNED = 3  # control points at each end, which are fixed by the state there
+KNOT_SPACING = 0.1  # aimed at [s]
 LEAST_SPANS, MOST_SPANS = 8, 40
-ROUNDS = 4  # of steps, between which a motion over its limits gets more time
+ROUNDS = 4  # rounds of steps of a repair, between which a motion over its limits gets more time
 SLOWER = 1.02  # least factor on its duration then
+ROUND, MOST_ROUNDS = 4, 8  # optimizer steps in a round of a pool, and largest number of rounds of a candidate
+PENALTY = 2.0  # factor on the priority of a candidate for every round spent on it
+CLEAR = -0.003  # clearance at the samples above which a proof is tried; spheres protrude [m]
+ENOUGH = 0.03  # clearance at which a round ends early [m]
+REFIT = 64  # states of a candidate that is refitted to another start
+FASTER = 0.9  # factor on the duration of a proved motion, from which a faster one is sought
+LONGEST = 60.0  # duration at which a candidate is dropped [s]
+LEAST = 1e-6  # clearance cost that counts as none
 
 
 @dataclass(frozen=True)
@@ -36,7 +48,7 @@ class MotionSettings:
         scene_margin: Clearance to obstacles and dynamic obstacles below which a sample costs [m].
         own_margin: Clearance between the robot's own links below which a sample costs [m].
         stiffness: Weight of half the integral of the speed squared over the share of the motion [1/rad^2].
-        limit_weight: Weight of half the square of what a limit is exceeded by, as a share of it.
+        limit_weight: Weight of half the square of the excess over a limit, as a share of it.
         limit_share: Share of the limits above which there is a cost.
         damping: Weight of the speed of the change at the first step.
         steps: Largest number of steps of a round.
@@ -55,7 +67,7 @@ class MotionSettings:
 
 
 class Start(NamedTuple):
-    """What a robot does when a motion begins: position, velocity and acceleration, each of shape (dof,)."""
+    """State in which a motion starts: position, velocity and acceleration, each of shape (dof,)."""
 
     position: Array
     velocity: Array
@@ -73,12 +85,12 @@ class Start(NamedTuple):
 
 
 class TimedSpline(NamedTuple):
-    """A uniform cubic B-spline in time, which begins in a given way and ends at rest.
+    """A uniform cubic B-spline in time, from a given state to rest.
 
     Attributes:
-        control: Control points, shape (P, dof) [rad]; the first three say how it begins, the last three are the goal.
+        control: Control points, shape (P, dof) [rad]; the first three fix the start, the last three are the goal.
         spacing: Knot spacing [s].
-        start: How it begins.
+        start: State in which it starts.
     """
 
     control: Array
@@ -95,10 +107,10 @@ class TimedSpline(NamedTuple):
         """Return the spline whose control points are states of a motion, evenly spaced in time.
 
         Args:
-            states: States of the motion, evenly spaced in time, shape (N, dof); from a moving start they begin as that.
+            states: States of the motion, evenly spaced in time, shape (N, dof); the first is the start.
             duration: Its duration [s]; the spline takes a knot spacing longer, since it rounds the end, and another one
                 from rest.
-            start: How the spline begins.
+            start: State in which the spline starts.
             goal: Where it ends, shape (dof,).
 
         Raises:
@@ -116,7 +128,7 @@ class TimedSpline(NamedTuple):
         return cls(control, spacing, start).lasting(spacing)
 
     def lasting(self, spacing: float) -> TimedSpline:
-        """Return the spline with another knot spacing [s] and the same begin."""
+        """Return the spline with another knot spacing [s] and the same start."""
         control = self.control.copy()
         control[:PINNED] = start_points(self.start, spacing)
         if not self.start.moves:
@@ -124,7 +136,7 @@ class TimedSpline(NamedTuple):
         return TimedSpline(control, spacing, self.start)
 
     def trajectory(self, joint_names: Sequence[str]) -> Trajectory:
-        """Return the motion itself; begin and end are exact, and so are joints that stay."""
+        """Return the motion itself; start and end are exact, and so are joints that stay."""
         motion = spline_in_time(self.control, self.spacing, tuple(joint_names), self.start)
         inner = motion.positions[1:-1]  # averages of control points
         np.clip(inner, self.control.min(axis=0), self.control.max(axis=0), out=inner)
@@ -137,7 +149,7 @@ class MotionOptimizer:
     The cost is that of :class:`apex_ompl.kernel.moving.MotionCost`.
 
     Attributes:
-        samples: Number of samples that steps have looked at so far.
+        samples: Number of samples of all steps so far.
     """
 
     def __init__(
@@ -161,10 +173,10 @@ class MotionOptimizer:
 
         Args:
             spline: The spline.
-            clock: Time of the dynamic obstacles' stamps when it begins [s].
+            clock: Time of the dynamic obstacles' stamps when it starts [s].
             steps: Most steps; by default the settings'.
             enough: The steps end when the clearances at the samples reach this [m].
-            damping: Of the first step; by default the settings'. The report has that to go on with.
+            damping: Damping of the first step; by default the settings'. The report has that of the next one.
 
         Raises:
             ParameterError: Control points of another shape.
@@ -190,7 +202,7 @@ class MotionOptimizer:
         Args:
             spline: Where to start from.
             accepts: The full check; asked about motions within the limits.
-            clock: Time of the dynamic obstacles' stamps when it begins [s].
+            clock: Time of the dynamic obstacles' stamps when it starts [s].
             stop: Asked between rounds whether to give up.
         """
         names = self.kernel.robot.joint_names
@@ -243,7 +255,7 @@ class MotionOptimizer:
 
 @lru_cache(maxsize=64)
 def _grid(points: int, samples: int) -> PathGrid:
-    """Return weights at the samples, where they begin, and the matrix of the speed over the share of the motion."""
+    """Return weights at the samples, where they start, and the matrix of the speed over the share of the motion."""
     spans = points - PINNED
     at = (np.arange(samples) + 0.5) / samples
     weights = np.tile(_basis(at), (spans, 1))
@@ -265,3 +277,146 @@ def _basis(x: Array) -> Array:
 def _slopes(x: Array) -> Array:
     """Return the derivatives of :func:`_basis` with respect to the share, shape (N, 4)."""
     return np.stack([-((1 - x) ** 2), 3 * x**2 - 4 * x, -3 * x**2 + 2 * x + 1, x**2], axis=1) / 2.0
+
+
+@dataclass(eq=False)
+class MotionCandidate:
+    """A motion under repair.
+
+    Attributes:
+        spline: The motion.
+        goal: Where it ends, shape (dof,).
+        origin: Name of what made it.
+        cost: Part of its cost that is due to clearance.
+        clear: Whether a proof is tried: no sample is in contact.
+        damping: Damping of the next step.
+        rounds: Number of rounds that it had.
+        given_up: Whether it is dropped.
+    """
+
+    spline: TimedSpline
+    goal: Array
+    origin: str
+    cost: float
+    clear: bool
+    damping: float | None = None
+    rounds: int = 0
+    given_up: bool = False
+
+    @property
+    def priority(self) -> float:
+        """Clearance cost times duration, doubled for every round; the least is improved next."""
+        return (self.cost + LEAST) * self.spline.duration * PENALTY**self.rounds
+
+
+class MotionPool:
+    """Candidates for a motion from one start; the most promising one is improved next.
+
+    Attributes:
+        candidates: All candidates.
+    """
+
+    def __init__(
+        self, optimizer: MotionOptimizer, start: Start, clock: float, budget: ComputeBudget,
+        accepts: Callable[[Trajectory], bool], *, clearance_margin: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Start an empty pool.
+
+        Args:
+            optimizer: Improves motions among the obstacles.
+            start: State of the robot when the motions start.
+            clock: Clock time then [s].
+            budget: Counts the samples.
+            accepts: The proof.
+            clearance_margin: Margin of the optimizer's obstacles that a motion may lack when its proof is tried [m].
+        """
+        self._optimizer, self._start, self._clock, self._budget = optimizer, start, clock, budget
+        self._accepts, self._least = accepts, CLEAR - clearance_margin
+        self.candidates: list[MotionCandidate] = []
+        self._own: dict[bytes, float] = {}
+
+    def add(self, states: Array, duration: float, goal: Array, origin: str) -> MotionCandidate:
+        """Add a motion.
+
+        Args:
+            states: States evenly spaced in time, shape (N, dof).
+            duration: Its duration [s].
+            goal: Where it ends, shape (dof,).
+            origin: Name of what made it.
+        """
+        spline = TimedSpline.along(states, duration, self._start, goal)
+        one = MotionCandidate(spline, goal, origin, np.inf, False)
+        self._improve(one, 0)
+        self.candidates.append(one)
+        return one
+
+    def carry(self, one: MotionCandidate, shift: float) -> None:
+        """Add a candidate of an earlier pool, whose motion was to start some time earlier [s].
+
+        It is kept where the robot still is at rest at its start, and refitted to the robot's state otherwise.
+        """
+        old, now = one.spline.start, self._start
+        resting = not (old.velocity.any() or now.velocity.any() or now.acceleration.any())
+        if resting and np.array_equal(old.position, now.position):
+            same = replace(one, damping=None)
+            self._improve(same, 0)
+            self.candidates.append(same)
+            return
+        motion = one.spline.trajectory(self._optimizer.kernel.robot.joint_names)
+        start = min(shift, 0.5 * motion.duration)
+        rest = motion(np.linspace(start, motion.duration, REFIT))
+        self.add(rest, motion.duration - start, one.goal, one.origin)
+
+    def improve(self, shorter: Callable[[], float], until: float = np.inf) -> tuple[MotionCandidate, Trajectory] | None:
+        """Improve candidates until one is proved, or the time is up.
+
+        Args:
+            shorter: Returns the duration that motions must be shorter than [s].
+            until: Time of the budget at which to pause [s].
+        """
+        while not self._budget.over() and self._budget.spent < until:
+            open_ones = [
+                one
+                for one in self.candidates
+                if one.rounds < MOST_ROUNDS and not one.given_up and one.spline.duration < shorter()
+            ]
+            if not open_ones:
+                return None
+            one = min(open_ones, key=lambda one: one.priority)
+            if not one.clear or one.rounds:
+                self._improve(one, ROUND)
+            one.rounds += 1
+            least = least_knot_spacing(one.spline.control, self._optimizer.limits)
+            if least > one.spline.spacing:
+                one.spline = one.spline.lasting(max(least, SLOWER * one.spline.spacing))
+                one.given_up = one.spline.duration > LONGEST
+                if least_knot_spacing(one.spline.control, self._optimizer.limits) > one.spline.spacing:
+                    continue
+                self._improve(one, 0)
+            if not one.clear or one.spline.duration >= shorter():
+                continue
+            motion = one.spline.trajectory(self._optimizer.kernel.robot.joint_names)
+            if self._accepts(motion):
+                one.spline, one.rounds = one.spline.lasting(FASTER * one.spline.spacing), 0  # next, a faster one
+                self._improve(one, 0)
+                return one, motion
+        return None
+
+    def _own_clearance(self, goal: Array) -> float:
+        """Return the least clearance of the robot's own spheres at the start and a goal [m]: held objects may touch."""
+        key = goal.tobytes()
+        if key not in self._own:
+            ends = np.stack([self._start.position, goal])
+            self._own[key] = float(self._optimizer.kernel.clearance(ends, 0.1)[:, 1].min())
+        return self._own[key]
+
+    def _improve(self, one: MotionCandidate, steps: int) -> None:
+        before = self._optimizer.samples
+        one.spline, report = self._optimizer.improve(
+            one.spline, clock=self._clock, steps=steps, enough=ENOUGH, damping=one.damping
+        )
+        self._budget.spend("sample of a motion", self._optimizer.samples - before)
+        one.cost = report.clearance_cost
+        ends = self._own_clearance(one.goal)
+        one.clear = report.scene_clearance >= self._least and report.own_clearance >= min(0.0, ends) + CLEAR
+        one.damping = report.damping if steps else one.damping

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import RunResult
-from apex_ompl.moving.scripted import ScriptedDynamicObstacles
+from apex_ompl.moving.dynamic_obstacles import ScriptedDynamicObstacles
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot

@@ -19,7 +19,7 @@ import trimesh
 from apex_ompl import problems
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.problems.world_robot import RobotPlaces
-from apex_ompl.problems.world_scripts import ScriptedWorld
+from apex_ompl.problems.world_scripts import ScriptedEnvironment
 from apex_ompl.scene.bodies import Obstacle, PlaceInTime
 from apex_ompl.scene.scripts import row_of
 from apex_ompl.types import Array
@@ -41,10 +41,10 @@ LOW, HIGH = np.array([-0.4, -0.9, 0.0]), np.array([0.9, 0.9, 1.1])  # where plac
 STANDS = 1e-3  # change of a joint in a decision below which the robot stands [rad]
 AHEAD = 0.15  # time by which the robot's motion is extrapolated [s]
 
-Decide = Callable[["AttackWorld", float, Array, Array, Array], Array]
+Decide = Callable[["AttackEnvironment", float, Array, Array, Array], Array]
 
 
-def wandering(world: AttackWorld, time: float, here: Array, q: Array, speed: Array) -> Array:
+def wandering(world: AttackEnvironment, time: float, here: Array, q: Array, speed: Array) -> Array:
     """Go to drawn places, stop for a while, turn at once."""
     del q, speed
     rng = world.rng
@@ -55,13 +55,13 @@ def wandering(world: AttackWorld, time: float, here: Array, q: Array, speed: Arr
     return world.target
 
 
-def chasing(world: AttackWorld, time: float, here: Array, q: Array, speed: Array) -> Array:
+def chasing(world: AttackEnvironment, time: float, here: Array, q: Array, speed: Array) -> Array:
     """Go to the nearest link."""
     del time, speed
     return world.nearest(here, q)
 
 
-def ambushing(world: AttackWorld, time: float, here: Array, q: Array, speed: Array) -> Array:
+def ambushing(world: AttackEnvironment, time: float, here: Array, q: Array, speed: Array) -> Array:
     """Stand until the robot moves, then dart to where the nearest link will be; go away after a while."""
     if time < world.until:
         return world.target
@@ -72,7 +72,7 @@ def ambushing(world: AttackWorld, time: float, here: Array, q: Array, speed: Arr
     return world.target
 
 
-def blocking(world: AttackWorld, time: float, here: Array, q: Array, speed: Array) -> Array:
+def blocking(world: AttackEnvironment, time: float, here: Array, q: Array, speed: Array) -> Array:
     """Go between a hand and its goal, nearer to the hand the longer it takes."""
     del here, speed
     hand = world.places.hands[int(world.rng.integers(len(world.places.hands)))] if time < PERIOD else world.hand
@@ -82,7 +82,7 @@ def blocking(world: AttackWorld, time: float, here: Array, q: Array, speed: Arra
     return (1.0 - share) * world.places.hand(q, hand) + share * world.places.hand(goal, hand)
 
 
-def swinging(world: AttackWorld, time: float, here: Array, q: Array, speed: Array) -> Array:
+def swinging(world: AttackEnvironment, time: float, here: Array, q: Array, speed: Array) -> Array:
     """Go to and fro across the nearest link, turning at drawn times."""
     del speed
     if time >= world.until:
@@ -91,7 +91,7 @@ def swinging(world: AttackWorld, time: float, here: Array, q: Array, speed: Arra
     return target + 0.3 * world.side * world.across
 
 
-def frightening(world: AttackWorld, time: float, here: Array, q: Array, speed: Array) -> Array:
+def frightening(world: AttackEnvironment, time: float, here: Array, q: Array, speed: Array) -> Array:
     """Come near whenever the robot stands, and go into its way whenever it moves."""
     del time
     if np.abs(speed).max() * PERIOD < STANDS:
@@ -117,7 +117,7 @@ def shapes(folder: Path) -> tuple[dict[str, Any], ...]:
     )  # fmt: skip
 
 
-class AttackWorld(ScriptedWorld):
+class AttackEnvironment(ScriptedEnvironment):
     """Bodies that decide every 0.03 s where to go, at their largest speed.
 
     Attributes:

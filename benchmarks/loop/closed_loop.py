@@ -32,11 +32,11 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from apex_ompl import plan, problems
-from apex_ompl.loop.replan.methods import METHODS
+from apex_ompl import plan, problems, run
+from apex_ompl.loop.replan.methods import names
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import CLOCKS, run
-from apex_ompl.moving.charges import cost_table
+from apex_ompl.loop.run import CLOCKS
+from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.problems import worlds
 from apex_ompl.timing.parameterization import Timing
 from apex_ompl.util import provenance
@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: %(default)s)")
     parser.add_argument("--split", default="test", choices=("test", "validation"))
     parser.add_argument("--kinds", nargs="+", default=list(worlds.kinds()), choices=worlds.kinds())
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--methods", nargs="+", default=names(), choices=names())
     parser.add_argument("--speeds", nargs="+", type=float, default=list(SPEEDS))
     parser.add_argument("--clock", default=SIMULATED, choices=CLOCKS, help="of runs that are made (default: sim)")
     parser.add_argument("--clairvoyant", type=one_or_more, default=60, help="its worlds (default: %(default)s)")

@@ -28,23 +28,20 @@ from apex_ompl.baselines.control.mppi import PathIntegral, softmax
 from apex_ompl.baselines.control.potential_field import PotentialField
 from apex_ompl.baselines.control.short_horizon import Horizon
 from apex_ompl.baselines.damon.lazy_search import LazySearch
-from apex_ompl.baselines.damon.replanner import ManifoldGraph
-from apex_ompl.baselines.drrt.goal_tree import GoalTree
-from apex_ompl.baselines.drrt.replanner import Clearances, KeptTree
-from apex_ompl.baselines.gpmp.replanner import CHARGE, IncrementalGPMP2
-from apex_ompl.baselines.imitation.replanner import Imitation
+from apex_ompl.baselines.damon.replanner import DamonReplanner
+from apex_ompl.baselines.drrt.dynamic_rrt import GoalTree
+from apex_ompl.baselines.drrt.replanner import Clearances, DynamicRRTReplanner
+from apex_ompl.baselines.gpmp.replanner import WORK, IncrementalGPMP2
+from apex_ompl.baselines.imitation.replanner import ImitationReplanner
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.loop.replan.paper import OneProposal
-from apex_ompl.loop.replan.proposals import Proposals
-from apex_ompl.loop.replan.snapshot import Snapshot
-from apex_ompl.loop.replan.sprint import CHARGE as SPRINT
-from apex_ompl.loop.replan.sprint import Sprint
-from apex_ompl.moving.charges import TABLE, Charges, cost_table
+from apex_ompl.loop.replan.one_plan import OneProposal, RRTConnectFromRest
+from apex_ompl.loop.replan.sources import WORK as SPRINT
+from apex_ompl.loop.replan.sources import Proposals, Sprint
+from apex_ompl.moving.compute_costs import TABLE, ComputeBudget, cost_table
+from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time, curve_of, prove_motion
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Request
+from apex_ompl.moving.replanner import Request
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.search import AGE, GUARDED, MOTIONS, SPREAD, Search
 from apex_ompl.moving.settings import LoopSettings
@@ -82,13 +79,15 @@ def seconds(call: Callable[[], Any]) -> float:
     return min(times)
 
 
-def interval_of_proof(ready: Ready) -> float:
+def interval_of_proof(context: RunContext) -> float:
     """Return what an interval of a proof by spheres alone costs, of a motion of the robot without obstacles [s]."""
-    checker, rng = CollisionChecker(ready.setup.robot), np.random.default_rng(0)
+    checker, rng = CollisionChecker(context.setup.robot), np.random.default_rng(0)
     for _ in range(100):
-        ends = ready.setup.robot.home + rng.normal(size=(2, len(ready.names))) * 0.3
-        ends[:, ready.fingers] = 0.5
-        motion = time_path(np.clip(ends, ready.limits.lower, ready.limits.upper), ready.limits, ready.names).trajectory
+        ends = context.setup.robot.home + rng.normal(size=(2, len(context.names))) * 0.3
+        ends[:, context.fingers] = 0.5
+        motion = time_path(
+            np.clip(ends, context.limits.lower, context.limits.upper), context.limits, context.names
+        ).trajectory
         proof = checker.prove(curve_of(motion), tolerance=0.0)
         if proof and proof.by_spheres == 1.0:
             return seconds(lambda m=motion: checker.prove(curve_of(m), tolerance=0.0)) / proof.intervals
@@ -108,32 +107,32 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     """Add what each kind of work costs a unit in a world [s]."""
     world = worlds.load(name)
     setup = assemble(world.problem.still)
-    ready = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
-    kernel, limits, goal = ready.kernel, ready.limits, ready.goals[0]
+    context = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
+    kernel, limits, goal = context.kernel, context.limits, context.goals[0]
     dynamic = DynamicObstacles(world.present(0.0))
     ends = np.stack([setup.start, goal])
-    found["straight motion"].append(seconds(lambda: time_path(ends, limits, ready.names)))
-    motion = time_path(ends, limits, ready.names).trajectory
+    found["straight motion"].append(seconds(lambda: time_path(ends, limits, context.names)))
+    motion = time_path(ends, limits, context.names).trajectory
     still = np.zeros_like(ends)
-    found["direct motion"].append(seconds(lambda: between(np.stack([ends, still, still]), limits, ready.names)))
+    found["direct motion"].append(seconds(lambda: between(np.stack([ends, still, still]), limits, context.names)))
     pieces = motion.states(np.array([0.0, 0.5 * motion.duration, motion.duration]))
-    piece = seconds(lambda: through(pieces, limits, ready.names, 0.0))  # the first one is too long
+    piece = seconds(lambda: through(pieces, limits, context.names, 0.0))  # the first one is too long
     found["piece of a motion"].append(piece)
-    found["joined motion"].append(seconds(lambda: through(pieces, limits, ready.names)) - 2.0 * piece)
+    found["joined motion"].append(seconds(lambda: through(pieces, limits, context.names)) - 2.0 * piece)
     one, half = Following(motion, 0.0), 0.5 * motion.duration
-    then = half + ready.settings.period
-    found["proved stop"].append(seconds(lambda: ready.proved_stop(reachable(dynamic, half), one, half, then)))
+    then = half + context.settings.period
+    found["proved stop"].append(seconds(lambda: context.proved_stop(reachable(dynamic, half), one, half, then)))
     moments = np.arange(0.0, motion.duration, GUARDED)
-    looked, _ = ready.foreseen_stops(dynamic, one, moments, AGE, SPREAD)
+    looked, _ = context.foreseen_stops(dynamic, one, moments, AGE, SPREAD)
     if looked > 0:
-        taken = seconds(lambda: ready.foreseen_stops(dynamic, one, moments, AGE, SPREAD))
+        taken = seconds(lambda: context.foreseen_stops(dynamic, one, moments, AGE, SPREAD))
         found["foreseen stop"].append(taken / min(looked + 1, len(moments)))
-    found["stop joint by joint"].append(seconds(lambda: ready.clear_stop(one, half, along=False)))
+    found["stop joint by joint"].append(seconds(lambda: context.clear_stop(one, half, along=False)))
     curve = curve_of(motion)
-    rate = interval_of_proof(ready)
+    rate = interval_of_proof(context)
     found["proof interval"].append(rate)
-    proof = ready.checker.prove(curve, tolerance=0.0)
-    taken = seconds(lambda: ready.checker.prove(curve, tolerance=0.0))
+    proof = context.checker.prove(curve, tolerance=0.0)
+    taken = seconds(lambda: context.checker.prove(curve, tolerance=0.0))
     if proof.by_spheres < 1.0:
         found["exact proof"].append(max(taken - rate * proof.intervals, 0.0))
     intervals = prove_motion(kernel, dynamic, motion).intervals
@@ -155,23 +154,23 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
         limits.lower,
         limits.upper,
     )
-    found["path in time"].append(seconds(lambda: time_path(bent, limits, ready.names)))
+    found["path in time"].append(seconds(lambda: time_path(bent, limits, context.names)))
 
 
 def controls(name: str, found: dict[str, list[float]]) -> None:
     """Add what each kind of work of the controls over a short horizon, and of dynamic RRT, costs a unit in a world."""
     world = worlds.load(name)
     setup = assemble(world.problem.still)
-    ready = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
-    dynamic, standing = DynamicObstacles(world.present(0.0)), Following.standing(setup.start, 0.0, ready.names)
-    search = Search(ready, Request(1, 0.0, 0.05, standing, None, dynamic, dynamic, (), np.inf, 0), Charges(0.1))
-    control, horizon = PathIntegral(), Horizon(ready.limits)
+    context = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings())
+    dynamic, standing = DynamicObstacles(world.present(0.0)), Following.resting(setup.start, 0.0, context.names)
+    search = Search(context, Request(1, 0.0, 0.05, standing, None, dynamic, dynamic, (), np.inf, 0), ComputeBudget(0.1))
+    control, horizon = PathIntegral(), Horizon(context.limits)
     points = horizon.roll(search.start, control.tried(search, horizon))
     states = np.ascontiguousarray(points[3:]).reshape(-1, points.shape[2])
     times = np.repeat(0.05 * np.arange(control.steps), control.rollouts)
     some = np.ascontiguousarray(states[:: control.sparse])
-    moving = seconds(lambda: clearance_in_time(ready.kernel, dynamic, states, times, control.berth))
-    own = seconds(lambda: ready.kernel.clearance(some, control.own_berth))
+    moving = seconds(lambda: clearance_in_time(context.kernel, dynamic, states, times, control.clearance_margin))
+    own = seconds(lambda: context.kernel.clearance(some, control.own_margin))
     found["near clearance in time"].append(moving / len(states))
     found["near clearance"].append(own / len(some))
 
@@ -182,26 +181,26 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     found["state of a rollout"].append(max(seconds(rollouts) - moving - own, 0.0) / len(states))
     one = np.zeros((control.steps, len(setup.start)))
     found["short motion"].append(
-        seconds(lambda: horizon.motion(search.start, horizon.roll(search.start, one[:, None])[:, 0], ready.names))
+        seconds(lambda: horizon.motion(search.start, horizon.roll(search.start, one[:, None])[:, 0], context.names))
     )
     reflex = PotentialField()
     found["force"].append(seconds(lambda: reflex.controls(search, horizon)) / reflex.steps)
     factors = IncrementalGPMP2()
-    _, guess = next(factors.guesses(search))
-    graph = factors.problem(search, guess.duration)
-    begun = factors.supports(search, guess, guess.duration)
-    count = graph.maximum(begun, factors.iterations, 0.0).evaluations * len(graph.times)
-    found[CHARGE].append(seconds(lambda: graph.maximum(begun, factors.iterations, 0.0)) / count)
-    step = KeptTree().search.step
-    tree = GoalTree(ready.goals, step, 200)
+    _, initial = next(factors.initial_motions(search))
+    graph = factors.problem(search, initial.duration)
+    started = factors.supports(search, initial, initial.duration)
+    count = graph.maximum(started, factors.iterations, 0.0).evaluations * len(graph.times)
+    found[WORK].append(seconds(lambda: graph.maximum(started, factors.iterations, 0.0)) / count)
+    step = DynamicRRTReplanner().search.step
+    tree = GoalTree(context.goals, step, 200)
     while not tree.full:
-        q = search.rng.uniform(ready.limits.lower, ready.limits.upper)
+        q = search.rng.uniform(context.limits.lower, context.limits.upper)
         tree.extend(tree.nearest(q), q, lambda first, last: np.ones(len(first), bool))
     tree.trim(lambda first, last: np.arange(len(first)) < len(first) - 1)
     once, q = anew(search), search.start.position
     first, last = (ends[:1] for ends in tree.edges)
     Clearances(once).edges(first, last)
-    looked, of_own = (once.charges.counts[kind] for kind in ("near clearance in time", "near clearance"))
+    looked, of_own = (once.budget.counts[kind] for kind in ("near clearance in time", "near clearance"))
     before = seconds(lambda: Clearances(anew(search)).edges(first, last))
     each = max(before - looked * moving / len(states) - of_own * own / len(some), 0.0)
     found["extension of a tree"].append(each + seconds(lambda: tree.extend(tree.nearest(q), q, refused)))
@@ -210,13 +209,13 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
 def graph(name: str, found: dict[str, list[float]]) -> None:
     """Add what a query of DAMON's graph costs before it searches, and each node that a search reaches."""
     setup = assemble(worlds.load(name).problem.still)
-    ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), ManifoldGraph()
-    source.prepare(ready)
+    context, source = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), DamonReplanner()
+    source.prepare(context)
     damon = source.damon
     states, start = damon.states(setup.start), setup.start[None]
     usable = np.ones(len(states), bool)
-    found["query of a graph"].append(seconds(lambda: damon.search(states, usable, start, ready.goals)))
-    search, reached = LazySearch(replace(damon.graph, states=states), usable, start, ready.goals), list[int]()
+    found["query of a graph"].append(seconds(lambda: damon.search(states, usable, start, context.goals)))
+    search, reached = LazySearch(replace(damon.graph, states=states), usable, start, context.goals), list[int]()
     search.connect(start=0, nodes=np.arange(100))  # and no goal: all that can be reached is
     taken = seconds(lambda: search.run(refused, lambda: False, reached.append))
     found["node of a graph"].append(taken / max(reached[0], 1))
@@ -233,29 +232,32 @@ def trees() -> dict[str, float]:
     for name in worlds.ids("moving", "validation", 30):
         world = worlds.load(name)
         setup, present = assemble(world.problem.still), tuple(world.present(0.0))
-        ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Snapshot()
-        source.prepare(ready)
-        dynamic, standing = DynamicObstacles(present), Following.standing(setup.start, 0.0, ready.names)
+        context, source = (
+            RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings()),
+            RRTConnectFromRest(),
+        )
+        source.prepare(context)
+        dynamic, standing = DynamicObstacles(present), Following.resting(setup.start, 0.0, context.names)
         search = Search(
-            ready, Request(2, 0.0, 0.05, standing, None, dynamic, dynamic, present, np.inf, 0), Charges(0.1)
+            context, Request(2, 0.0, 0.05, standing, None, dynamic, dynamic, present, np.inf, 0), ComputeBudget(0.1)
         )
         with quiet_ompl():
             begin = time.perf_counter()
             source.path(search, proved=False)
             spent += time.perf_counter() - begin
-        motions += search.charges.counts["motion of a tree"]
+        motions += search.budget.counts["motion of a tree"]
         sprint = Sprint()
-        sprint.prepare(ready)
+        sprint.prepare(context)
         first = anew(search)
-        list(sprint.guesses(first))
-        sprinted += seconds(lambda one=sprint, of=search: list(one.guesses(anew(of))))
-        states += first.charges.counts[SPRINT]
+        list(sprint.initial_motions(first))
+        sprinted += seconds(lambda one=sprint, of=search: list(one.initial_motions(anew(of))))
+        states += first.budget.counts[SPRINT]
     return {"motion of a tree": spent / motions, SPRINT: sprinted / states}
 
 
 def anew(search: Search) -> Search:
     """Return the same replan, begun anew."""
-    return Search(search.ready, search.request, Charges(search.charges.limit))
+    return Search(search.context, search.request, ComputeBudget(search.budget.limit))
 
 
 def network() -> dict[str, float]:
@@ -263,13 +265,13 @@ def network() -> dict[str, float]:
     from apex_ompl.apex.query import make_query
 
     setup = assemble(worlds.load("vertical/moving-large-0.2/800000").problem.still)
-    ready, source = Ready(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Proposals()
-    source.prepare(ready)
+    context, source = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Proposals()
+    source.prepare(context)
     model, checker = source.model_and_checker
-    query = make_query(checker, setup.start, ready.goals[0], point=model.sees_point)
-    policy = Imitation()
-    policy.prepare(ready)
-    begin, end = setup.start, ready.goals[0]
+    query = make_query(checker, setup.start, context.goals[0], point=model.sees_point)
+    policy = ImitationReplanner()
+    policy.prepare(context)
+    begin, end = setup.start, context.goals[0]
     chunk = seconds(lambda: policy.states(begin, end)) / (policy.steps / 8)
     taken = {}
     with model.one_thread():
@@ -279,8 +281,8 @@ def network() -> dict[str, float]:
     paths = {}
     for guided, kind in ((False, "path of the paper"), (True, "guided path of the paper")):
         paper = OneProposal(guided)
-        paper.prepare(ready)
-        paths[kind] = seconds(lambda one=paper: one.propose(setup.start, ready.goals[0], np.random.default_rng(0)))
+        paper.prepare(context)
+        paths[kind] = seconds(lambda one=paper: one.propose(setup.start, context.goals[0], np.random.default_rng(0)))
     return {"proposals": taken[1] - each, "proposal": each, **paths, "chunk of a policy": chunk}
 
 
@@ -291,12 +293,12 @@ def in_replans(alone: Mapping[str, float], names: Sequence[str]) -> tuple[dict[s
     for planner in PLANNERS:
         timed = replan_times(planner, names)
         new, old = ([kind for kind in timed.counts if (kind in known) == there] for there in (False, True))
-        charged, rest = timed.charged(costs, new), timed.seconds - timed.charged(costs, old)
-        factor = max(rest / charged, LEAST_FACTOR) if charged > LEAST_SHARE * timed.seconds else 1.0
+        spending, rest = timed.spending(costs, new), timed.seconds - timed.spending(costs, old)
+        factor = max(rest / spending, LEAST_FACTOR) if spending > LEAST_SHARE * timed.seconds else 1.0
         costs |= {kind: factor * costs[kind] for kind in new}
         known |= set(new)
         about[planner] = {"factor": factor, "replans": timed.replans, "seconds": timed.seconds}
-        about[planner]["by_package"] = timed.seconds / timed.charged(package)
+        about[planner]["by_package"] = timed.seconds / timed.spending(package)
     return costs, about
 
 

@@ -19,8 +19,7 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time, curve_of, prove_motion
-from apex_ompl.moving.retime import retime
-from apex_ompl.moving.safe_intervals import blocked
+from apex_ompl.moving.retime import blocked, retime
 from apex_ompl.moving.stopping import stop, stop_along
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
@@ -119,7 +118,7 @@ def costs(checker: CollisionChecker, count: int) -> dict[str, list[float]]:
                 states, moments = motion(ends), ends
                 for name, call in (
                     ("blocked intervals of 256 pieces among 3",
-                     lambda m=dynamic, q=motion, p=places: blocked(kernel, m, q, p, begin=0.0, end=10.0)),
+                     lambda m=dynamic, q=motion, p=places: blocked(kernel, m, q, p, start=0.0, end=10.0)),
                     ("retiming among 3", lambda m=dynamic, q=motion: retime(kernel, m, q, limits)),
                     ("clearance of 257 states among 3",
                      lambda m=dynamic, s=states, t=moments: clearance_in_time(kernel, m, s, t, 0.1)),

@@ -20,15 +20,15 @@ import json
 import math
 from typing import Any
 
+from apex_ompl import run
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
-from apex_ompl.loop.run import run
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
-from benchmarks.loop.attack_worlds import KIND, SUITES, AttackWorld
+from benchmarks.loop.attack_worlds import KIND, SUITES, AttackEnvironment
 from benchmarks.loop.closed_loop import FOLDER, SCRIPTED, Job, kept, made_by, stored
 
 DEPENDS = (
@@ -54,7 +54,7 @@ def made(job: Job) -> dict[str, Any]:
     method = job.method.partition("+")[0]
     if kind_of(job.world) != KIND:
         return kept(job, run(job.world, method, speed=job.speed, seed=0, settings=settings))
-    world = AttackWorld(number, FOLDER.with_name("guarded_runs"))
+    world = AttackEnvironment(number, FOLDER.with_name("guarded_runs"))
     return kept(job, run(world, method, speed=job.speed, seed=0, settings=settings, sensor=world.sensor))
 
 

@@ -25,14 +25,14 @@ from apex_ompl.evaluation import Results, Row, Workers, bench, runs
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
 from apex_ompl.evaluation.summary import Statistics
-from apex_ompl.moving.swept import check_timed_path, constant_velocity_times
+from apex_ompl.moving.timed_proof import check_timed_path, constant_velocity_times
 from apex_ompl.problems.alignment import VELOCITY_SCALE
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more, whole_number
 from benchmarks.lib import record
 
-DEPENDS = ("@benchmark", "apex_ompl/moving/swept.py")
+DEPENDS = ("@benchmark", "apex_ompl/moving/timed_proof.py")
 FOLDER = record.RESULTS.parent / "runs" / "calibration"
 TIMEOUT, LIMITS = 10.0, (0.5, 2.0, 10.0)  # [s]
 LINE, PLANNERS = "straight line", ("rrtconnect", "rrt")

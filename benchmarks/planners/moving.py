@@ -23,7 +23,7 @@ from apex_ompl import problems
 from apex_ompl.evaluation import Results, Row, Workers, bench, runs
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
-from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.moving.timed_proof import check_timed_path
 from apex_ompl.planning.among_dynamic_obstacles import RETIMED, SPACE_TIME, STAGES
 from apex_ompl.problems.alignment import SIZES, SPEEDS, VELOCITY_SCALE
 from apex_ompl.problems.suite_robot import robot

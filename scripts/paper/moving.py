@@ -16,15 +16,14 @@ from paper.figure import Made, blank, number, of_runs, ratio, ratio_cells
 from paper.rows import BOTH, FAITHFUL, METHODS, MOVING, OURS, PACE, SWEEPS, SWEPT, TASKS, UNGUIDED, color, installed
 from paper.static import median, of_task, runs_of
 
+from apex_ompl import run
 from apex_ompl.evaluation import Results, Row
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
 from apex_ompl.evaluation.summary import Table
 from apex_ompl.loop.replan import methods
 from apex_ompl.loop.result import RunResult
-from apex_ompl.loop.run import load_world, run
-from apex_ompl.loop.sensor import Sensor
-from apex_ompl.moving.charges import cost_table
+from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.paths.path import path_length
 from apex_ompl.problems.alignment import SIZES
@@ -41,11 +40,10 @@ def loop_result(problem: str, method: str, seed: int, limit: float, params: dict
     Raises:
         ApexError: The world, the replanner or a parameter is unknown or faulty.
     """
-    world, sensor = load_world(problem), Sensor(seed=seed)
     changed = {name: value for name, value in params.items() if name not in ("speed", "prediction")}
     settings = LoopSettings(**{"timeout": limit, **changed})
     prediction = params.get("prediction", settings.prediction)
-    return run(world, method, prediction=prediction, seed=seed, speed=params["speed"], settings=settings, sensor=sensor)
+    return run(problem, method, prediction=prediction, seed=seed, speed=params["speed"], settings=settings)
 
 
 def loop_run(job: Job) -> Run:

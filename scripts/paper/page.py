@@ -15,7 +15,7 @@ from paper.rows import PACE, PATIENCE
 from paper.static import TIMEOUT
 
 from apex_ompl.model.guidance import EQUATION_7
-from apex_ompl.moving.charges import cost_table
+from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.util.files import write_atomically
 from benchmarks.lib import record

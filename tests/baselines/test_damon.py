@@ -21,11 +21,16 @@ from support import DATA, ROOT
 
 from apex_ompl import plan, planners
 from apex_ompl.baselines import weights_folder
-from apex_ompl.baselines.damon.latent_graph import consecutive, farthest_points, free_of_self_collision, neighbors
+from apex_ompl.baselines.damon.latent_graph import (
+    Damon,
+    consecutive,
+    farthest_points,
+    free_of_self_collision,
+    neighbors,
+)
 from apex_ompl.baselines.damon.lazy_search import Graph, LazySearch
 from apex_ompl.baselines.damon.manifold import load_manifold, shared_manifold
-from apex_ompl.baselines.damon.queries import Damon
-from apex_ompl.baselines.damon.sampling import sample_states, split_sample
+from apex_ompl.baselines.damon.manifold_training import sample_states, split_sample
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError

@@ -12,8 +12,7 @@ from ompl import base as ob
 from planning import solved
 
 from apex_ompl import plan, planners
-from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
-from apex_ompl.baselines.drrt.goal_tree import GoalTree
+from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT, GoalTree
 from apex_ompl.baselines.drrt.planner import DRRT
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.discretization import sample_path
@@ -90,7 +89,7 @@ def test_without_a_last_path_it_is_rrt() -> None:
     start, goal, free = np.array([-0.9, -0.9]), np.array([0.9, 0.9]), outside(np.zeros(2), 0.5)
     search, rng = DynamicRRT(STEP, 0.1, 0.6), np.random.default_rng(4)
     found = search.grow(
-        search.begin(goal[None]), start[None], lambda: rng.uniform(-1.0, 1.0, 2), rng=rng, free=free,
+        search.rooted_at(goal[None]), start[None], lambda: rng.uniform(-1.0, 1.0, 2), rng=rng, free=free,
         stop=lambda: False,
     )  # fmt: skip
     rng, nodes, parents = np.random.default_rng(4), [goal], [-1]

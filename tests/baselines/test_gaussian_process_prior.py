@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apex_ompl.baselines.gpmp.block_tridiagonal import BlockTridiagonal
-from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
+from apex_ompl.baselines.gpmp.gaussian_process import BlockTridiagonal, GaussianProcess
 from apex_ompl.baselines.gpmp.optimizer import CostFunctional, FactorGraph
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.clearance_costs import ClearanceCosts

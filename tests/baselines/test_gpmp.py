@@ -6,21 +6,20 @@ import itertools
 
 import numpy as np
 import pytest
-from loops import PROBLEM, go, ready_of, setup_of
+from loops import PROBLEM, context_of, go, setup_of
 from ompl import base as ob
 
-from apex_ompl import MotionPlanner, plan, planners, problems
+from apex_ompl import MotionPlanner, plan, planners, problems, run
 from apex_ompl.baselines.gpmp.planner import GaussianProcessPlanner
 from apex_ompl.baselines.gpmp.replanner import IncrementalGPMP, IncrementalGPMP2
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel.clearance_costs import clearance_costs
-from apex_ompl.loop.replan.methods import METHODS
-from apex_ompl.loop.run import run
-from apex_ompl.moving.charges import Charges
+from apex_ompl.loop.replan.methods import named
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import Following
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.request import Request
+from apex_ompl.moving.replanner import Request
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.paths.spline import Spline
@@ -46,14 +45,14 @@ def check(result: PlanResult, problem: Problem, robot: Robot) -> None:
 
 
 @pytest.fixture(scope="module")
-def ready(robot: Robot) -> PlanningSetup:
+def context(robot: Robot) -> PlanningSetup:
     return assemble(problems.load("wall/easy/5"), robot)
 
 
-def test_the_cost_of_states_is_that_of_the_optimizer(ready: PlanningSetup) -> None:
-    spline, kernel = Spline(), ready.checker.kernel
+def test_the_cost_of_states_is_that_of_the_optimizer(context: PlanningSetup) -> None:
+    spline, kernel = Spline(), context.checker.kernel
     settings = OptimizerSettings(samples=40, scene_margin=0.08, own_margin=0.03, stiffness=1e-12)
-    line = spline.line(ready.start, ready.goals[0])
+    line = spline.line(context.start, context.goals[0])
     about, _ = Optimizer(spline, settings).evaluate(kernel, line)
     found = clearance_costs(kernel, spline.basis((np.arange(40) + 0.5) / 40) @ line, 0.08, 0.03)
     assert found.cost.max() > 1.0 and found.cost.mean() == pytest.approx(about.clearance_cost[0], rel=1e-9)
@@ -62,13 +61,13 @@ def test_the_cost_of_states_is_that_of_the_optimizer(ready: PlanningSetup) -> No
     assert np.linalg.eigvalsh(found.gram).min() > -1e-9
 
 
-def test_gradients_of_states_are_those_of_finite_differences(ready: PlanningSetup) -> None:
+def test_gradients_of_states_are_those_of_finite_differences(context: PlanningSetup) -> None:
     """Among obstacles that stand, and one that comes by."""
-    palm = ready.robot.link_pose(ready.start, "left_hand_palm")[:3, 3]
+    palm = context.robot.link_pose(context.start, "left_hand_palm")[:3, 3]
     box = Obstacle(name="box", box=(0.1,) * 3, position=tuple((palm + (0, 0.4, 0.1)).tolist()), velocity=(0, -0.3, 0))
-    dynamic, kernel, rng = DynamicObstacles([box]), ready.checker.kernel, np.random.default_rng(0)
-    states = np.linspace(ready.start, ready.goals[0], 30) + 0.02 * rng.normal(size=(30, ready.robot.dof))
-    states = np.clip(states, ready.robot.limits.lower + 1e-3, ready.robot.limits.upper - 1e-3)
+    dynamic, kernel, rng = DynamicObstacles([box]), context.checker.kernel, np.random.default_rng(0)
+    states = np.linspace(context.start, context.goals[0], 30) + 0.02 * rng.normal(size=(30, context.robot.dof))
+    states = np.clip(states, context.robot.limits.lower + 1e-3, context.robot.limits.upper - 1e-3)
     times = np.linspace(0.0, 1.5, 30)
 
     def cost(q: np.ndarray) -> np.ndarray:
@@ -87,8 +86,8 @@ def test_gradients_of_states_are_those_of_finite_differences(ready: PlanningSetu
     np.testing.assert_allclose(found.clearance[:, 0], np.minimum(alone.clearance[:, 0], moving), atol=1e-12)
 
 
-def test_states_that_the_tables_do_not_hold_for_cost_everything(ready: PlanningSetup) -> None:
-    kernel, bad = ready.checker.kernel, np.stack([ready.start, ready.start])
+def test_states_that_the_tables_do_not_hold_for_cost_everything(context: PlanningSetup) -> None:
+    kernel, bad = context.checker.kernel, np.stack([context.start, context.start])
     bad[1, -1] = 1.7
     found = clearance_costs(kernel, bad, 0.05, 0.05)
     assert np.isfinite(found.cost[0]) and np.isinf(found.cost[1]) and not found.gradient[1].any()
@@ -215,34 +214,36 @@ def test_faults_name_the_thing(name: str, values: dict, error: type[Exception], 
 @pytest.mark.parametrize("kind", [IncrementalGPMP, IncrementalGPMP2])
 def test_the_replanner_begins_as_the_robot_moves(kind: type[IncrementalGPMP2]) -> None:
     """From the middle of a motion: with its velocity and acceleration, proved, and charged by counts."""
-    ready = ready_of(PROBLEM)
+    context = context_of(PROBLEM)
     replanner = kind()
-    replanner.prepare(ready)
+    replanner.prepare(context)
     dynamic = DynamicObstacles([Obstacle(name="far", box=(0.1,) * 3, position=(2.0, 2.0, 1.0))])
-    standing = Following.standing(ready.setup.start, 0.0, ready.names)
+    standing = Following.resting(context.setup.start, 0.0, context.names)
 
-    def ask(following: Following, route: Following | None, join: float) -> tuple[Following, Charges]:
-        charges = Charges(0.2)
+    def ask(following: Following, route: Following | None, join: float) -> tuple[Following, ComputeBudget]:
+        budget = ComputeBudget(0.2)
         request = Request(1, join - 0.05, join, following, route, dynamic, 0.0, (), np.inf, 0)
-        found = replanner.replan(ready, request, charges).found
-        assert found is not None and found.to_goal and ready.clear_of_still(found.motion)
-        return found, charges
+        found = replanner.replan(context, request, budget).found
+        assert found is not None and found.to_goal and context.clear_of_static(found.motion)
+        return found, budget
 
-    first, charges = ask(standing, None, 0.05)
-    assert charges.spent > 0.0 and charges.counts["state of a factor graph"] % 40 == 0
+    first, budget = ask(standing, None, 0.05)
+    assert budget.spent > 0.0 and budget.counts["state of a factor graph"] % 40 == 0
     join = 0.05 + 0.4 * first.motion.duration
     second, _ = ask(first, first, join)
-    behind = first.start(join)
+    behind = first.at(join)
     assert np.abs(behind.velocity).max() > 0.05
     for order in range(3):
         np.testing.assert_allclose(second.motion(0.0, order), behind[order], atol=1e-9)
     assert second.motion.duration < first.motion.duration
-    assert replanner.replan(ready, Request(1, 0.0, 0.05, standing, None, dynamic, 0.0, (), np.inf, 0), Charges(0.0))
+    assert replanner.replan(
+        context, Request(1, 0.0, 0.05, standing, None, dynamic, 0.0, (), np.inf, 0), ComputeBudget(0.0)
+    )
 
 
 @pytest.mark.parametrize("name", ["gpmp", "gpmp2"])
 def test_the_loop_reaches_its_goal_with_it(name: str) -> None:
-    done, report = go(METHODS[name].make(), timeout=6.0, **METHODS[name].settings)
+    done, report = go(named(name).make(), timeout=6.0, **named(name).settings)
     assert done.reached and report.contact is None and max(report.limit_use.values()) <= 1.0 + 1e-9
     assert setup_of(PROBLEM).valid_goals.shape[1] == done.trajectory.dof
     moving = "vertical/moving-medium-0.1/800000"

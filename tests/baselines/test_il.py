@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from imitations import config
-from loops import PROBLEM, crossing, go, ready_of, setup_of
+from loops import PROBLEM, context_of, crossing, go, setup_of
 from ompl import base as ob
 from planning import cached_problem, within
 from support import ROOT, needs
@@ -21,18 +21,18 @@ from apex_ompl.apex.query import make_query
 from apex_ompl.baselines.imitation import policy as policies
 from apex_ompl.baselines.imitation.checkpoint import save_policy
 from apex_ompl.baselines.imitation.policy import shared_policy
-from apex_ompl.baselines.imitation.replanner import Imitation
+from apex_ompl.baselines.imitation.replanner import ImitationReplanner
 from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.referee import RefereeReport
-from apex_ompl.loop.replan.methods import METHODS
+from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.replanning import SHARE
-from apex_ompl.moving.charges import Charges, cost_table
+from apex_ompl.moving.compute_costs import ComputeBudget, cost_table
+from apex_ompl.moving.context import Following
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.request import Request
+from apex_ompl.moving.replanner import Request
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.paths.path import FINE_RESOLUTION
@@ -77,14 +77,14 @@ def free(problem: Problem) -> Problem:
 
 def solved(problem: Problem, params: dict[str, Any], seconds: float = 20.0) -> tuple[Any, np.ndarray | None, Any]:
     """Status, path and report of a planner inside OMPL, where straight lines are not tried before."""
-    ready = assemble(problem)
-    planner = planners.make("il", ready.simple_setup.getSpaceInformation(), **params)
-    ready.simple_setup.setPlanner(planner)
-    status = ready.simple_setup.solve(within(seconds)).getStatus()
+    context = assemble(problem)
+    planner = planners.make("il", context.simple_setup.getSpaceInformation(), **params)
+    context.simple_setup.setPlanner(planner)
+    status = context.simple_setup.solve(within(seconds)).getStatus()
     exact = status == ob.PlannerStatus.EXACT_SOLUTION
-    path = path_to_array(ready.simple_setup.getSolutionPath(), 16) if exact else None
+    path = path_to_array(context.simple_setup.getSolutionPath(), 16) if exact else None
     report = planner.report
-    ready.simple_setup.clear()
+    context.simple_setup.clear()
     return status, path, report
 
 
@@ -134,23 +134,23 @@ def test_repair_is_a_control_that_finds_what_the_policy_did_not(straight: Path, 
 
 
 def test_a_path_that_stops_short_is_no_solution_unless_it_is_within_reach(bent: Path, free: Problem) -> None:
-    ready = assemble(free)
-    query = make_query(ready.checker, ready.start, ready.goals[0])
-    rolled = shared_policy(bent).roll_out([query], ready.checker.kernel)
+    context = assemble(free)
+    query = make_query(context.checker, context.start, context.goals[0])
+    rolled = shared_policy(bent).roll_out([query], context.checker.kernel)
     assert rolled is not None
-    off = float(np.abs(rolled[0, -1] - ready.goals[0]).max())
+    off = float(np.abs(rolled[0, -1] - context.goals[0]).max())
     assert off > 1e-3
     status, path, report = solved(free, {"model": str(bent), "reach": 0.99 * off})
     assert path is None and status == ob.PlannerStatus.ABORT
     assert f"the path stops {off:.3g} rad short of the goal" in report.reason
     status, path, _ = solved(free, {"model": str(bent), "reach": 1.01 * off})
     assert path is not None and len(path) == 65
-    np.testing.assert_array_equal(path[-1], ready.goals[0])
+    np.testing.assert_array_equal(path[-1], context.goals[0])
     np.testing.assert_array_equal(path[:-1], rolled[0])
     assert densely_free(free, path)
     status, path, _ = solved(free, {"model": str(bent), "reach": 0.0, "pin": True})
     assert path is not None and len(path) == 64
-    np.testing.assert_array_equal(path[-1], ready.goals[0])
+    np.testing.assert_array_equal(path[-1], context.goals[0])
 
 
 def test_the_nearest_goal_comes_first_and_then_each_in_turn(straight: Path, problem: Problem) -> None:
@@ -168,12 +168,12 @@ def test_the_nearest_goal_comes_first_and_then_each_in_turn(straight: Path, prob
 
 
 def test_it_stops_with_its_condition(straight: Path, free: Problem) -> None:
-    ready = assemble(free)
-    planner = planners.make("il", ready.simple_setup.getSpaceInformation(), model=str(straight))
-    ready.simple_setup.setPlanner(planner)
-    ready.simple_setup.setup()
+    context = assemble(free)
+    planner = planners.make("il", context.simple_setup.getSpaceInformation(), model=str(straight))
+    context.simple_setup.setPlanner(planner)
+    context.simple_setup.setup()
     calls = iter(range(10_000))
-    status = ready.simple_setup.solve(ob.PlannerTerminationCondition(lambda: next(calls) > 4))
+    status = context.simple_setup.solve(ob.PlannerTerminationCondition(lambda: next(calls) > 4))
     assert status.getStatus() == ob.PlannerStatus.TIMEOUT and planner.report.proposed == 0
     begin = time.perf_counter()
     assert plan(cached_problem(BLOCKED), "il", params={"model": str(straight)}, timeout=0.01).path is None
@@ -223,14 +223,14 @@ def test_what_is_missing_or_wrong_is_named(straight: Path, problem: Problem, mon
 
 
 def looped(model: Path, *obstacles: Obstacle, **settings: Any) -> tuple[RunRecord, RefereeReport]:
-    method = Imitation(str(model), steps=32)
-    method.prepare(ready_of(PROBLEM, **settings))
+    method = ImitationReplanner(str(model), steps=32)
+    method.prepare(context_of(PROBLEM, **settings))
     return go(method, *obstacles, **settings)
 
 
 @pytest.fixture
 def loop_settings() -> Iterator[dict[str, Any]]:
-    yield {"timeout": 6.0, **METHODS["il"].settings}
+    yield {"timeout": 6.0, **named("il").settings}
 
 
 def test_the_loop_reaches_the_goal_where_nothing_is_in_the_way(straight: Path, loop_settings: dict[str, Any]) -> None:
@@ -253,25 +253,25 @@ def test_the_loop_follows_the_policy_unproved_into_what_it_does_not_avoid(
 
 
 def test_a_replan_begins_as_the_robot_moves_and_is_charged_by_chunks(straight: Path) -> None:
-    ready = ready_of(PROBLEM, **METHODS["il"].settings)
-    method = Imitation(str(straight), steps=16)
-    method.prepare(ready)
-    begin, moving = 0.0, Following.standing(ready.setup.start, 0.0, ready.names)
+    context = context_of(PROBLEM, **named("il").settings)
+    method = ImitationReplanner(str(straight), steps=16)
+    method.prepare(context)
+    begin, moving = 0.0, Following.resting(context.setup.start, 0.0, context.names)
     for number in range(1, 5):
-        join, charges = begin + 0.1, Charges(SHARE * ready.settings.budget)
+        join, budget = begin + 0.1, ComputeBudget(SHARE * context.settings.budget)
         nothing = DynamicObstacles(())
         request = Request(number, begin, join, moving, None, nothing, 0.0, (), np.inf, 0)
-        answer = method.replan(ready, request, charges)
+        answer = method.replan(context, request, budget)
         assert answer.found is not None
-        motion, expected = answer.found.motion, moving.start(join)
+        motion, expected = answer.found.motion, moving.at(join)
         for order in range(3):
             np.testing.assert_allclose(motion(0.0, order), expected[order], atol=1e-9)
-        assert max(motion.use(ready.limits).values()) <= 1.0 + 1e-9
+        assert max(motion.use(context.limits).values()) <= 1.0 + 1e-9
         assert not motion.velocities[-1].any()
-        chunks = charges.counts["chunk of a policy"]
+        chunks = budget.counts["chunk of a policy"]
         assert chunks == -(-16 // 8)
         seconds = cost_table()["seconds"]
-        assert charges.spent == pytest.approx(chunks * seconds["chunk of a policy"] + seconds["straight motion"])
+        assert budget.spent == pytest.approx(chunks * seconds["chunk of a policy"] + seconds["straight motion"])
         begin, moving = join, answer.found
 
 

@@ -222,6 +222,6 @@ def test_roll_outs_are_the_policy_step_by_step(saved: Path, paths: Paths, kernel
                 rest = chunk[executed:]
                 states += list(np.clip(taken[: min(executed, CLOCK - len(states))], lower, upper))
             np.testing.assert_allclose(path, np.array(states), atol=1e-5)
-    part = policy.roll_out(queries, kernel, begin=CLOCK - 6, steps=64)
+    part = policy.roll_out(queries, kernel, first_step=CLOCK - 6, steps=64)
     assert part is not None and part.shape == (5, 6, 16)
     assert policy.roll_out(queries, kernel, stop=lambda: True) is None

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from loops import PROBLEM, crossing, go, setup_of
 
+from apex_ompl import run
 from apex_ompl.baselines.control.mppi import softmax
 from apex_ompl.baselines.control.potential_field import Field, PotentialField, repulsive
 from apex_ompl.baselines.control.short_horizon import Horizon
-from apex_ompl.loop.replan.methods import METHODS
+from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.result import Outcome
-from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.timed_spline import Start
@@ -25,7 +25,7 @@ MOVING = "vertical/moving-medium-0.1/800000"
 
 @pytest.mark.parametrize("name", CONTROLS[1:])  # path integrals reach it among what moves, below
 def test_the_goal_is_reached_where_nothing_is_in_the_way(name: str) -> None:
-    done, report = go(METHODS[name].make(), timeout=6.0, **METHODS[name].settings)
+    done, report = go(named(name).make(), timeout=6.0, **named(name).settings)
     assert done.reached and report.contact is None
     assert max(report.limit_use.values()) <= 1.0 + 1e-9
 
@@ -44,7 +44,7 @@ def test_nothing_is_touched_while_the_robot_moves(name: str) -> None:
 @pytest.mark.parametrize("name", CONTROLS)
 def test_a_box_that_crosses_is_not_run_into(name: str) -> None:
     box = crossing(setup_of(PROBLEM))
-    done, report = go(METHODS[name].make(), box, timeout=2.5, fastest=0.5, **METHODS[name].settings)
+    done, report = go(named(name).make(), box, timeout=2.5, fastest=0.5, **named(name).settings)
     assert done.broken == 0 and done.unguarded == 0 and report.moving_contact is None
 
 

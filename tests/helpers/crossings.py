@@ -6,11 +6,26 @@ import numpy as np
 
 from apex_ompl.kernel import Kernel
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
+from apex_ompl.moving.timed_proof import constant_velocity_times
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
 
 SPEEDS = (0.1, 0.2, 0.4)  # of dynamic obstacles [m/s]
+
+
+def problem_with(robot: Robot, *scene: Obstacle) -> Problem:
+    """A problem that stays at home, among some obstacles."""
+    home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
+    return Problem(name="moving", robot=robot.name, scene=scene, start=home, goal=Goal(joints=(home,)))
+
+
+def path_from_home(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A random path from home of four states, and their times at a constant velocity."""
+    path = robot.home + np.cumsum(rng.normal(0.0, 0.12, (4, robot.dof)), axis=0)
+    path = np.clip(path, robot.limits.lower, robot.limits.upper)
+    return path, constant_velocity_times(robot, path, 0.5)
 
 
 def arm_motion(robot: Robot, rng: np.random.Generator, speed: float) -> Trajectory:

@@ -9,10 +9,9 @@ from typing import Any
 
 from loops import line
 
-from apex_ompl.moving.charges import Charges
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import Following, RunContext
+from apex_ompl.moving.replanner import Answer, Request
 
 
 class Faulty:
@@ -21,10 +20,10 @@ class Faulty:
     def __init__(self, *faults: str) -> None:
         self.faults, self.calls = faults, 0
 
-    def prepare(self, ready: Ready) -> None:
-        del ready
+    def prepare(self, context: RunContext) -> None:
+        del context
 
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Any:
+    def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Any:
         fault = ("", *self.faults)[min(self.calls, len(self.faults))]
         self.calls += 1
         if fault == "orphaned" and os.fork() == 0:  # a child that holds the connection open
@@ -34,12 +33,12 @@ class Faulty:
             os.kill(os.getpid(), signal.SIGKILL)
         if fault == "never":
             time.sleep(3600.0)
-        while fault == "busy" and not charges.over():
+        while fault == "busy" and not budget.over():
             time.sleep(0.001)
         if fault == "late":
             time.sleep(0.2)
         if fault == "raises":
             raise ValueError("a bad number")
         if fault == "nonsense":
-            return Answer(Following(line(ready, request).motion, request.join + 1.0), "nonsense", charges)
-        return Answer(line(ready, request), "line", charges)
+            return Answer(Following(line(context, request).motion, request.join + 1.0), "nonsense", budget)
+        return Answer(line(context, request), "line", budget)

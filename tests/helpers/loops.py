@@ -10,25 +10,24 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
+from apex_ompl.loop.clocks import simulate
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.referee import RefereeReport, judge
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.loop.simulation import simulate
-from apex_ompl.moving.charges import Charges
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import Following, RunContext
+from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.moving.timed_spline import Start, TimedSpline
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.problems.world_scripts import moving_world
-from apex_ompl.problems.worlds import World
+from apex_ompl.problems.world_scripts import environment_of
+from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.spline_method import least_knot_spacing
 
 PROBLEM, BLOCKED = "vertical/free/1", "vertical/free/0"  # the straight line is free, and meets what stands still
-Find = Callable[[Ready, Request], Following | None]
+Find = Callable[[RunContext, Request], Following | None]
 FAR = Obstacle(name="far", box=(0.1, 0.1, 0.1), position=(2.0, 2.0, 1.0), velocity=(0.0, 0.01, 0.0))
 
 
@@ -38,13 +37,13 @@ class ByHand:
     def __init__(self, find: Find, seconds: float = 0.03) -> None:
         self.find, self.seconds, self.asked = find, seconds, []
 
-    def prepare(self, ready: Ready) -> None:
+    def prepare(self, context: RunContext) -> None:
         """Nothing is needed."""
 
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+    def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
         self.asked.append(request)
-        charges.spent += self.seconds
-        return Answer(self.find(ready, request), "by hand", charges)
+        budget.spent += self.seconds
+        return Answer(self.find(context, request), "by hand", budget)
 
 
 @cache
@@ -52,38 +51,38 @@ def setup_of(name: str) -> PlanningSetup:
     return assemble(problems.load(name).still, seed=0)
 
 
-def line(ready: Ready, request: Request) -> Following:
+def line(context: RunContext, request: Request) -> Following:
     """The straight line to the goal, whatever is in its way."""
-    start, goal = request.following.start(request.join), ready.goals[0]
-    return Following(line_from(ready, start, goal), request.join, to_goal=True)
+    start, goal = request.following.at(request.join), context.goals[0]
+    return Following(line_from(context, start, goal), request.join, to_goal=True)
 
 
-def line_from(ready: Ready, start: Start, goal: np.ndarray) -> Trajectory:
+def line_from(context: RunContext, start: Start, goal: np.ndarray) -> Trajectory:
     if not np.stack(start)[1:].any():
-        return time_path(np.stack([start.position, goal]), ready.limits, ready.names).trajectory
+        return time_path(np.stack([start.position, goal]), context.limits, context.names).trajectory
     spline = TimedSpline.along(np.linspace(start.position, goal, 32), 0.8, start, goal)
     for _ in range(20):
-        least = least_knot_spacing(spline.control, ready.limits)
+        least = least_knot_spacing(spline.control, context.limits)
         if least <= spline.spacing:
             break
         spline = spline.lasting(max(least, 1.05 * spline.spacing))
-    return spline.trajectory(ready.names)
+    return spline.trajectory(context.names)
 
 
-def ready_of(name: str, *, speed: float = 1.0, **parameters: Any) -> Ready:
+def context_of(name: str, *, speed: float = 1.0, **parameters: Any) -> RunContext:
     """What a run keeps ready."""
     setup, share = setup_of(name), 1.0 - 1e-6
     limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
     kinds = ("velocity", "acceleration", "jerk")
     limits = replace(limits, **{kind: share * getattr(limits, kind) for kind in kinds})
     settings = LoopSettings(**{"timeout": 3.0, "hastens": False, **parameters}).completed(0.024, 0.4)
-    return Ready(setup, limits, limits, settings)
+    return RunContext(setup, limits, limits, settings)
 
 
-def world_of(name: str, *obstacles: Obstacle) -> World:
+def world_of(name: str, *obstacles: Obstacle) -> DynamicEnvironment:
     """A problem's world with obstacles that move."""
     problem = problems.load(name).still
-    return moving_world(problem.model_copy(update={"scene": (*problem.scene, *(obstacles or (FAR,)))}))
+    return environment_of(problem.model_copy(update={"scene": (*problem.scene, *(obstacles or (FAR,)))}))
 
 
 def go(
@@ -91,12 +90,12 @@ def go(
     **parameters: Any,
 ) -> tuple[RunRecord, RefereeReport]:  # fmt: skip
     """A run, and what the referee says of it."""
-    ready, world = ready_of(name, speed=speed, **parameters), world_of(name, *obstacles)
-    stream = SensorStream(sensor or Sensor(), world, ready.settings.watched)
-    done = simulate(world, ready, replanner, stream, seed=0)
+    context, world = context_of(name, speed=speed, **parameters), world_of(name, *obstacles)
+    stream = SensorStream(sensor or Sensor(), world, context.settings.watched)
+    done = simulate(world, context, replanner, stream, seed=0)
     truth = problems.load(name).still
     truth = truth.model_copy(update={"scene": (*truth.scene, *world.script())})
-    return done, judge(ready.setup.robot, truth, done.trajectory, goals=ready.goals)
+    return done, judge(context.setup.robot, truth, done.trajectory, goals=context.goals)
 
 
 def boxes(seed: int, fastest: float) -> list[Obstacle]:

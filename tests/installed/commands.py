@@ -45,7 +45,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ((0,), "plan ball_in_cup --timeout 20 --no-timing --out path.json"),
     (
         (0, 1),
-        "run popup/vertical/large/12 --planner no-network --clock sim --prediction cv --speed 0.9 --budget 0.05 "
+        "run popup/vertical/large/12 --method no-network --clock sim --prediction cv --speed 0.9 --budget 0.05 "
         "--latency 0.05 --timeout 4 --evade risk --seed 1 --out run.npz --json",
     ),
     ((0, 1), "run own.yaml --clock real --timeout 3 --out real.json"),

@@ -248,7 +248,7 @@ def _use_run() -> None:
     """The closed loop."""
     import apex_ompl
 
-    result = apex_ompl.run("popup/vertical/large/12", planner="no-network")
+    result = apex_ompl.run("popup/vertical/large/12", method="no-network")
     for name in ("run.npz", "run.json"):
         result.save(name)
         assert apex_ompl.RunResult.load(name).as_dict() == result.as_dict()

@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loops import FAR, PROBLEM, ByHand, line, ready_of, world_of
+from loops import FAR, PROBLEM, ByHand, context_of, line, world_of
 
+from apex_ompl import run
 from apex_ompl.errors import ParameterError
-from apex_ompl.loop.cycle import Loop, RunRecord
-from apex_ompl.loop.late_steps import Decided, undo
-from apex_ompl.loop.observation import Observation
-from apex_ompl.loop.replanning import AtOnce
+from apex_ompl.loop.clocks import simulate
+from apex_ompl.loop.cycle import Decided, Loop, RunRecord, undo
+from apex_ompl.loop.environment import Observation
+from apex_ompl.loop.replanning import ImmediateReplanning
 from apex_ompl.loop.result import INTERRUPTED
-from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.loop.simulation import simulate
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.scene.scripts import place_at
@@ -28,9 +27,9 @@ PERIOD, NAN = LoopSettings.period, float("nan")
 
 
 def loop_of(replanner: Any, sensor: Sensor | None = None, **parameters: Any) -> Loop:
-    ready, world = ready_of(PROBLEM, **parameters), world_of(PROBLEM)
-    eyes = SensorStream(sensor or Sensor(), world, ready.settings.watched)
-    return Loop(world, ready, AtOnce(ready, replanner), eyes, seed=0)
+    context, world = context_of(PROBLEM, **parameters), world_of(PROBLEM)
+    eyes = SensorStream(sensor or Sensor(), world, context.settings.watched)
+    return Loop(world, context, ImmediateReplanning(context, replanner), eyes, seed=0)
 
 
 def steps(loop: Loop) -> Iterator[tuple[float, Decided, RunRecord | None]]:
@@ -108,7 +107,7 @@ def test_obstacles_that_count_as_standing_are_told_without_a_velocity() -> None:
 def test_the_filter_knows_how_much_a_sensor_errs() -> None:
     """With the noise of the default sensor it would take most of the errors of this one for turns, and begin anew."""
     sensor = Sensor(noise=0.03)
-    loop = loop_of(ByHand(lambda ready, request: None), sensor, error=sensor.largest_error, timeout=1.0)
+    loop = loop_of(ByHand(lambda context, request: None), sensor, error=sensor.largest_error, timeout=1.0)
     for _ in steps(loop):
         pass
     assert loop.executor.tracker.settings.noise == pytest.approx(0.03)
@@ -118,7 +117,7 @@ def test_the_filter_knows_how_much_a_sensor_errs() -> None:
 def test_a_world_is_for_one_run() -> None:
     world = world_of(PROBLEM)
     run(world, "no-network")
-    with pytest.raises(ParameterError, match="load it anew"):
+    with pytest.raises(ParameterError, match="load it again"):
         run(world, "no-network")
 
 
@@ -145,8 +144,8 @@ WATCHED = 10  # looks before the run
 
 def seen_by(eyes: Any, **parameters: Any) -> RunRecord:
     """A run with a sensor made by hand."""
-    ready, world = ready_of(PROBLEM, **{"timeout": 1.0, **parameters}), world_of(PROBLEM, NEAR)
-    return simulate(world, ready, ByHand(line), eyes, seed=0)
+    context, world = context_of(PROBLEM, **{"timeout": 1.0, **parameters}), world_of(PROBLEM, NEAR)
+    return simulate(world, context, ByHand(line), eyes, seed=0)
 
 
 def nowhere(k: int, one: Observation) -> Observation:
@@ -156,7 +155,7 @@ def nowhere(k: int, one: Observation) -> Observation:
 def test_a_robot_does_not_start_before_it_has_seen_what_is_there() -> None:
     assert seen_by(Changed(lambda k, one: one)).reached
     for change, words in (
-        (nowhere, "looks were refused, the last one since the place of near is not finite"),
+        (nowhere, "observations were refused, the last one since the place of near is not finite"),
         (lambda k, one: replace(one, seen=()), "never seen: near"),
     ):
         done = seen_by(Changed(change))
@@ -176,7 +175,7 @@ def test_a_robot_stops_where_there_is_no_look_of_use_for_too_long() -> None:
     """As when a camera is unplugged under way."""
     silent = Changed(lambda k, one: nowhere(k, one) if k > WATCHED + 3 else one)
     done = seen_by(silent, silence=0.2, timeout=2.0)
-    assert not done.reached and "no look was of use in the end" in done.reason
+    assert not done.reached and "no observation was usable in the end" in done.reason
     blind = next(event for event in done.events if event.kind == "blind")
     assert blind.time - blind.data["last"] == pytest.approx(0.2, abs=0.02)
     assert is_at_rest(done.trajectory, blind.time + 0.5) and not is_at_rest(done.trajectory, blind.time)
@@ -206,7 +205,7 @@ def test_a_sensor_that_fails_ends_the_run_at_rest_with_what_was_done_so_far(step
     assert is_at_rest(motion, motion.duration) and step * PERIOD - 1e-9 <= motion.duration < step * PERIOD + 0.6
 
 
-@pytest.mark.parametrize("where", ["advance", "observe", "step", "set_out"])
+@pytest.mark.parametrize("where", ["advance", "observe", "step", "announce_start"])
 def test_an_interrupt_stops_the_robot_and_returns_what_was_done_so_far(
     where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

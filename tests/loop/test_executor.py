@@ -12,25 +12,24 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, crossing, go, line, line_from, ready_of, setup_of
+from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, context_of, crossing, go, line, line_from, setup_of
 
+from apex_ompl import run
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.executor import Executor
 from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.replan.evasion import endangered, step_aside
-from apex_ompl.loop.replan.methods import METHODS
+from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.replanning import NOTICED, Reply
 from apex_ompl.loop.result import Event
-from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.loop.tracking import Tracker
-from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.search import EARLIER, Search
 from apex_ompl.moving.settings import EVADE, LoopSettings
 from apex_ompl.moving.timed_spline import Start
@@ -83,7 +82,7 @@ def test_the_robot_touches_nothing_while_it_moves(
 ) -> None:
     some, evade = boxes(seed, fastest), ("proved", "never")[seed // 2 % 2]
     parameters = {"prediction": prediction, "monitored": monitored, "hastens": hastens, "evade": evade}
-    replanner: Any = METHODS["no-network"].make() if seed % 2 else ByHand(line)
+    replanner: Any = named("no-network").make() if seed % 2 else ByHand(line)
     done, report = go(replanner, *some, sensor=Sensor(seed=seed), fastest=fastest, **parameters)
     assert done.broken == 0 and report.still_contact is None and done.unguarded == 0
     check_limits(report)
@@ -112,13 +111,13 @@ def asides(done: RunRecord) -> list[Event]:
 class Aside:
     """Steps aside, and nothing else."""
 
-    def prepare(self, ready: Ready) -> None:
+    def prepare(self, context: RunContext) -> None:
         """Nothing is needed."""
 
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
-        search, soon = Search(ready, request, charges), endangered(request.following, request.join, request.contact)
+    def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
+        search, soon = Search(context, request, budget), endangered(request.following, request.join, request.contact)
         found = step_aside(search) if soon else None
-        return Answer(None if found is None else search.following(found), "evade", charges)
+        return Answer(None if found is None else search.following(found), "evade", budget)
 
 
 def test_a_robot_steps_aside_where_that_is_proved_or_at_its_risk_or_never() -> None:
@@ -147,28 +146,30 @@ def test_a_step_aside_is_no_proof_of_what_the_robot_does_until_then(
     moves: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The robot still moves when the answer comes, or is at rest until it joins it: then the rest is proved alone."""
-    ready = ready_of(PROBLEM)
-    start, goal = ready.setup.start, ready.goals[0]
-    first = Following(line_from(ready, Start.at_rest(start), 0.95 * start + 0.05 * goal), 0.0)
+    context = context_of(PROBLEM)
+    start, goal = context.setup.start, context.goals[0]
+    first = Following(line_from(context, Start.at_rest(start), 0.95 * start + 0.05 * goal), 0.0)
     now, join = (0.5 if moves else 1.0) * first.end, first.end + 0.01
-    aside = Following(line_from(ready, Start.at_rest(first.motion.positions[-1]), start), join)
+    aside = Following(line_from(context, Start.at_rest(first.motion.positions[-1]), start), join)
     empty = DynamicObstacles(())
     request = Request(1, 0.0, join, first, None, empty, 0.05, (), now, 0, contact=now)
 
     def first_conflict(
-        dynamic: DynamicObstacles, one: Following, begin: float, until: float, charges: Any = None
+        dynamic: DynamicObstacles, one: Following, begin: float, until: float, budget: Any = None
     ) -> float:
         return begin if begin < join - 1e-9 else np.inf
 
     class Answered:
         def reply(self, now: float) -> Reply:
-            return Reply(1, Answer(aside, "evade", Charges(0.05)))
+            return Reply(1, Answer(aside, "evade", ComputeBudget(0.05)))
 
         def faults(self) -> tuple[str, ...]:
             return ()
 
-    monkeypatch.setattr(ready, "first_conflict", first_conflict)
-    executor = Executor(ready, Answered(), Tracker(ready.kernel), 0, first, pending=request, conflict=now, contact=now)
+    monkeypatch.setattr(context, "first_conflict", first_conflict)
+    executor = Executor(
+        context, Answered(), Tracker(context.kernel), 0, first, pending=request, conflict=now, contact=now
+    )
     before = executor.stop = Following(first.motion.after(now), now) if moves else None
     executor._answer(now, empty, empty)
     assert executor.following is not first and executor.aside is executor.following
@@ -181,11 +182,11 @@ def test_a_robot_that_leaves_at_its_risk_does_not_go_to_a_goal() -> None:
     refused = 0
     for gap in (0.08, 0.085, 0.09, 0.1):
 
-        def find(ready: Ready, request: Request) -> Following | None:
+        def find(context: RunContext, request: Request) -> Following | None:
             if request.following.at_rest(request.join):
-                return Aside().replan(ready, request, Charges(0.1)).found
-            search = Search(ready, request, Charges(0.05))
-            direct = search.direct(ready.goals[0])
+                return Aside().replan(context, request, ComputeBudget(0.1)).found
+            search = Search(context, request, ComputeBudget(0.05))
+            direct = search.direct(context.goals[0])
             return None if direct is None else search.following(direct)
 
         box = coming(setup_of(PROBLEM), gap)
@@ -256,9 +257,9 @@ def test_the_straight_line_is_followed_where_nothing_is_in_the_way() -> None:
     check_limits(report)
 
 
-def slow_at_first(ready: Ready, request: Request) -> Following:
+def slow_at_first(context: RunContext, request: Request) -> Following:
     """The straight line, three times as slow in the first answer."""
-    found = line(ready, request)
+    found = line(context, request)
     return replace(found, motion=found.motion.slower(3.0)) if request.number == 1 else found
 
 
@@ -276,56 +277,56 @@ def test_a_faster_motion_replaces_one_without_a_conflict() -> None:
     check_limits(report)
 
 
-def shifted(ready: Ready, request: Request) -> Following:
-    start = ready.setup.start.copy()
+def shifted(context: RunContext, request: Request) -> Following:
+    start = context.setup.start.copy()
     start[0] += 1e-3
-    return Following(line_from(ready, Start.at_rest(start), ready.goals[0]), request.join, to_goal=True)
+    return Following(line_from(context, Start.at_rest(start), context.goals[0]), request.join, to_goal=True)
 
 
-def under_way(ready: Ready, request: Request) -> Following:
+def under_way(context: RunContext, request: Request) -> Following:
     """Begins with a speed that the robot does not have."""
-    found = line(ready, request)
+    found = line(context, request)
     return Following(found.motion.after(0.1), request.join, to_goal=True)
 
 
-def unfinished(ready: Ready, request: Request) -> Following:
-    motion = line(ready, request).motion
+def unfinished(context: RunContext, request: Request) -> Following:
+    motion = line(context, request).motion
     half = np.searchsorted(motion.times, 0.5 * motion.duration)
     rows = (getattr(motion, name)[:half] for name in ("times", "positions", "velocities", "accelerations"))
     return Following(Trajectory(*rows, motion.joint_names), request.join)
 
 
-def fast(ready: Ready, request: Request) -> Following:
-    motion = line(ready, request).motion
+def fast(context: RunContext, request: Request) -> Following:
+    motion = line(context, request).motion
     rows = 0.5 * motion.times, motion.positions, 2.0 * motion.velocities, 4.0 * motion.accelerations
     return Following(Trajectory(*rows, motion.joint_names), request.join, to_goal=True)
 
 
-def boasting(ready: Ready, request: Request) -> Following:
-    halfway = 0.5 * (ready.setup.start + ready.goals[0])
-    return Following(line_from(ready, Start.at_rest(ready.setup.start), halfway), request.join, to_goal=True)
+def boasting(context: RunContext, request: Request) -> Following:
+    halfway = 0.5 * (context.setup.start + context.goals[0])
+    return Following(line_from(context, Start.at_rest(context.setup.start), halfway), request.join, to_goal=True)
 
 
-def hasty(ready: Ready, request: Request) -> Following:
-    return replace(line(ready, request), begin=request.join - 0.02)
+def hasty(context: RunContext, request: Request) -> Following:
+    return replace(line(context, request), start_time=request.join - 0.02)
 
 
-def renamed(ready: Ready, request: Request) -> Following:
-    found = line(ready, request)
-    return replace(found, motion=replace(found.motion, joint_names=tuple(reversed(ready.names))))
+def renamed(context: RunContext, request: Request) -> Following:
+    found = line(context, request)
+    return replace(found, motion=replace(found.motion, joint_names=tuple(reversed(context.names))))
 
 
 @pytest.mark.parametrize(
     ("find", "name", "why"),
-    [(shifted, PROBLEM, "it does not begin where the robot will be"),
-     (under_way, PROBLEM, "it does not begin where the robot will be"),
-     (hasty, PROBLEM, "it does not begin where the robot will be"),
+    [(shifted, PROBLEM, "it does not start where the robot will be"),
+     (under_way, PROBLEM, "it does not start where the robot will be"),
+     (hasty, PROBLEM, "it does not start where the robot will be"),
      (unfinished, PROBLEM, "it does not end at rest"),
      (boasting, PROBLEM, "it does not end at a goal"),
      (renamed, PROBLEM, "it is a motion of other joints"),
-     (fast, PROBLEM, "it exceeds limits, or is not proved clear of what stands still"),
-     (line, BLOCKED, "it exceeds limits, or is not proved clear of what stands still"),
-     (lambda ready, request: None, PROBLEM, "nothing was found")],
+     (fast, PROBLEM, "it exceeds limits, or is not proved clear of static obstacles"),
+     (line, BLOCKED, "it exceeds limits, or is not proved clear of static obstacles"),
+     (lambda context, request: None, PROBLEM, "nothing was found")],
     ids=["shifted", "under-way", "hasty", "unfinished", "boasting", "renamed", "fast", "blocked", "nothing"],
 )  # fmt: skip
 def test_answers_that_do_not_fit_are_rejected_and_the_robot_stands(find: Find, name: str, why: str) -> None:
@@ -340,12 +341,12 @@ def test_answers_that_do_not_fit_are_rejected_and_the_robot_stands(find: Find, n
 def test_answers_that_are_no_motion_are_rejected(fault: float, why: str) -> None:
     """As another process may send them."""
 
-    def torn(ready: Ready, request: Request) -> Following:
-        found = line(ready, request)
+    def torn(context: RunContext, request: Request) -> Following:
+        found = line(context, request)
         times, positions, *others = found.motion.knots
         positions = positions.copy()
         positions[len(times) // 2, 0] += fault
-        return replace(found, motion=Trajectory.unchecked(times, (positions, *others), ready.names))
+        return replace(found, motion=Trajectory.unchecked(times, (positions, *others), context.names))
 
     done, _ = go(ByHand(torn), timeout=0.5)
     assert stood(done) and {"it is no motion" in reason and why in reason for reason in reasons(done)} == {True}
@@ -353,10 +354,10 @@ def test_answers_that_are_no_motion_are_rejected(fault: float, why: str) -> None
 
 def first_line_then(find: Find) -> Find:
     """The straight line at first, and then something else."""
-    return lambda ready, request: line(ready, request) if request.number == 1 else find(ready, request)
+    return lambda context, request: line(context, request) if request.number == 1 else find(context, request)
 
 
-@pytest.mark.parametrize("find", [shifted, under_way, boasting, lambda ready, request: 1 / 0])
+@pytest.mark.parametrize("find", [shifted, under_way, boasting, lambda context, request: 1 / 0])
 def test_a_robot_that_moves_stops_where_answers_are_of_no_use(find: Find) -> None:
     box = crossing(setup_of(PROBLEM))
     done, report = go(ByHand(first_line_then(find)), box, prediction="still", speed=0.3, fastest=0.5)
@@ -372,7 +373,7 @@ def test_a_robot_that_moves_stops_where_answers_are_of_no_use(find: Find) -> Non
      (MemoryError(), "MemoryError: ")],
 )  # fmt: skip
 def test_a_way_of_replanning_that_fails_is_an_event(error: Exception, words: str) -> None:
-    def fail(ready: Ready, request: Request) -> Following:
+    def fail(context: RunContext, request: Request) -> Following:
         raise error
 
     done, _ = go(ByHand(fail), timeout=0.5)
@@ -381,7 +382,7 @@ def test_a_way_of_replanning_that_fails_is_an_event(error: Exception, words: str
 
 def test_something_that_is_no_answer_is_an_event() -> None:
     class Silent(ByHand):
-        def replan(self, ready: Ready, request: Request, charges: Charges) -> Any:
+        def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Any:
             return None
 
     done, _ = go(Silent(line), timeout=0.3)
@@ -421,7 +422,7 @@ def test_what_comes_to_a_standing_robot_does_not_wait_for_an_answer_that_knows_n
     box = Obstacle(
         name="box", box=(0.1, 0.1, 0.1), position=tuple(palm + (0.0, 0.0, 0.3)), velocity=(0.0, 0.0, -0.4), appears=0.53
     )
-    replanner = ByHand(lambda ready, request: None, seconds=0.042)
+    replanner = ByHand(lambda context, request: None, seconds=0.042)
     done, _ = go(replanner, box, timeout=1.0, guarded=guarded, hastens=not guarded)
     given_up = [event for event in done.events if event.data.get("why") == "an obstacle comes"]
     assert len(given_up) == 1
@@ -431,8 +432,8 @@ def test_what_comes_to_a_standing_robot_does_not_wait_for_an_answer_that_knows_n
     before, after = (next(one for one in replanner.asked if one.number == number + k) for k in (0, 1))
     assert before.asked < known < before.asked + 0.042 and np.isinf(before.conflict)
     assert after.asked == known and np.isfinite(after.conflict)
-    answered = next(e.time for e in done.events if e.kind == "rejected" and e.data["number"] == after.number)
-    assert 0.042 + NOTICED <= answered - known + 1e-9 <= 0.042 + NOTICED + LoopSettings.period + 1e-9
+    reply_of = next(e.time for e in done.events if e.kind == "rejected" and e.data["number"] == after.number)
+    assert 0.042 + NOTICED <= reply_of - known + 1e-9 <= 0.042 + NOTICED + LoopSettings.period + 1e-9
 
 
 def test_a_goal_that_is_reached_ends_the_run_whatever_is_under_way() -> None:
@@ -444,9 +445,9 @@ def test_a_goal_that_is_reached_ends_the_run_whatever_is_under_way() -> None:
     box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=rows[0][1:], trajectory=rows)
 
     class Slow(ByHand):
-        def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
             self.seconds = 0.03 if request.number == 1 else 9.0
-            return super().replan(ready, request, charges)
+            return super().replan(context, request, budget)
 
     replanner = Slow(line)
     done, report = go(replanner, box, fastest=0.5, hold=1.5)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from apex_ompl import run
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.loop.replan.methods import METHODS
+from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import run
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
@@ -79,4 +79,4 @@ def test_the_papers_loop_stops_at_its_distance_and_follows_what_is_not_proved() 
 
 def test_ways_that_plan_from_rest_say_so() -> None:
     for name in ("stop-and-wait", "rrtconnect", "apex-paper", "apex-paper-unguided"):
-        assert METHODS[name].settings["from_rest"]
+        assert named(name).settings["from_rest"]

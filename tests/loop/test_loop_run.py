@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loops import PROBLEM, ready_of, world_of
+from loops import PROBLEM, context_of, world_of
 from runs import motion_between
 
-from apex_ompl import problems
+from apex_ompl import problems, run
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.cycle import RunRecord
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome, RunResult
-from apex_ompl.loop.run import _Made, run
-from apex_ompl.moving.following import Following
+from apex_ompl.loop.run import _Run
+from apex_ompl.moving.context import Following
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.problems.suite_robot import robot
@@ -91,17 +91,18 @@ def test_whoever_is_late_and_comes_to_rest_at_the_goal_has_reached_it() -> None:
 
 @pytest.mark.parametrize(
     ("given", "words"),
-    [({"planner": "apx"}, "replanner 'apx', did you mean 'apex'"), ({"clock": "rel"}, "clock 'rel'"),
+    [({"method": "apx"}, "replanner 'apx', did you mean 'apex'"), ({"clock": "rel"}, "clock 'rel'"),
      ({"prediction": "cvv"}, "prediction 'cvv'"), ({"problem": "popup/vertical/larg/12"}, "size of cubes 'larg'"),
      ({"problem": "nothing"}, "world 'nothing'"), ({"problem": "no/such/file.yaml"}, "no/such/file.yaml"),
      ({"speed": 0.0}, "velocity_scale|speed"), ({"speed": NAN}, "velocity_scale|speed"),
      ({"speed": -1.0}, "velocity_scale|speed"), ({"speed": 1.5}, "velocity_scale|speed"), ({"seed": -1}, "seed"),
-     ({"seed": 0.5}, "seed"), ({"planner": 5}, "unknown replanner 5"), ({"clock": None}, "unknown clock None"),
+     ({"seed": 0.5}, "seed"), ({"method": 5}, "method: expected the name of a replanner, .*, got 5"),
+     ({"clock": None}, "unknown clock None"),
      ({"prediction": []}, "unknown prediction"), ({"settings": 5}, "settings: expected a LoopSettings, got 5"),
      ({"speed": 10**400}, "velocity_scale")],
 )  # fmt: skip
 def test_what_is_asked_for_wrongly_is_named(given: dict[str, Any], words: str) -> None:
-    arguments = {"problem": MOVING, "planner": "no-network", **given}
+    arguments = {"problem": MOVING, "method": "no-network", **given}
     with pytest.raises(ApexError, match=words):
         run(**arguments)
 
@@ -131,11 +132,11 @@ def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out(name: s
 
 def test_a_stop_that_ends_at_a_goal_is_one_to_the_goal() -> None:
     """Such a run has reached the goal, though what is followed last is a stop."""
-    ready = ready_of(PROBLEM)
-    goal = ready.goals[0]
-    motion = time_path(np.stack([ready.setup.start, goal]), ready.limits, ready.names).trajectory
+    context = context_of(PROBLEM)
+    goal = context.goals[0]
+    motion = time_path(np.stack([context.setup.start, goal]), context.limits, context.names).trajectory
     one = Following(motion, 0.0, to_goal=True)
-    stops = [ready.unproved_stop(one, time) for time in np.linspace(0.0, one.end, 100)]
+    stops = [context.unproved_stop(one, time) for time in np.linspace(0.0, one.end, 100)]
     there = [bool(np.abs(stop.motion.positions[-1] - goal).max() <= 1e-6) for stop in stops]
     assert [stop.to_goal for stop in stops] == there and 0 < sum(there) < len(there)
 
@@ -169,9 +170,9 @@ def test_a_goal_in_collision_is_no_error() -> None:
 
 
 def test_rest_elsewhere_than_at_a_goal_is_no_success() -> None:
-    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
-    q = ready.setup.start
+    context, world = context_of(PROBLEM), world_of(PROBLEM)
+    q = context.setup.start
     aside = np.where(np.arange(len(q)) == 0, q + 0.05 * np.sign(-q), q)
     record = RunRecord(motion_between(robot(), q, aside), (), reached=True, ended="", broken=0)
-    found = _Made(world, ready, "no-network", "simulated", 0, {}).judged(record)
+    found = _Run(world, context, "no-network", "simulated", 0, {}).judged(record)
     assert found.outcome is Outcome.MISALIGNED and found.reason == "the motion does not end at a goal"

@@ -15,34 +15,32 @@ from typing import Any
 import numpy as np
 import pytest
 from faulty_replanners import Faulty
-from loops import BLOCKED, PROBLEM, crossing, ready_of, setup_of, world_of
+from loops import BLOCKED, PROBLEM, context_of, crossing, setup_of, world_of
 
+from apex_ompl import run
 from apex_ompl.errors import PlannerProcessError
-from apex_ompl.loop import planner_process
+from apex_ompl.loop import replanning
+from apex_ompl.loop.clocks import run_in_real_time
 from apex_ompl.loop.cycle import Loop, RunRecord
-from apex_ompl.loop.observation import Observation
-from apex_ompl.loop.planner_process import PlannerProcess, Work
-from apex_ompl.loop.real_time import run_in_real_time
+from apex_ompl.loop.environment import Observation
+from apex_ompl.loop.planner_worker import rehearse
 from apex_ompl.loop.referee import RefereeReport, judge
-from apex_ompl.loop.rehearsal import rehearse
 from apex_ompl.loop.replan.methods import replanner_of
-from apex_ompl.loop.replanning import answered
+from apex_ompl.loop.replanning import PlannerProcess, Work, reply_of
 from apex_ompl.loop.result import INTERRUPTED, Outcome, RunResult
-from apex_ompl.loop.run import run
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.following import Following
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
-from apex_ompl.problems.worlds import World
+from apex_ompl.moving.replanner import Answer, Request
+from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.timing.trajectory import is_at_rest
 
 
 class BadEyes:
     """A sensor whose observations are doubled, out of order, late by turns, or not numbers."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: DynamicEnvironment) -> None:
         self._eyes = SensorStream(Sensor(), world, 0.3)
 
     def observations(self, until: float) -> list[Observation]:
@@ -56,15 +54,15 @@ class BadEyes:
 
 
 def go(*faults: str, eyes: type[BadEyes] | None = None) -> tuple[RunRecord, RefereeReport, PlannerProcess]:
-    ready = ready_of(PROBLEM, speed=0.3, prediction="still", fastest=0.5, timeout=3.0)
+    context = context_of(PROBLEM, speed=0.3, prediction="still", fastest=0.5, timeout=3.0)
     world = world_of(PROBLEM, crossing(setup_of(PROBLEM)))
-    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, faults, 0)
-    seen = SensorStream(Sensor(), world, ready.settings.watched) if eyes is None else eyes(world)
+    work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, faults, 0)
+    seen = SensorStream(Sensor(), world, context.settings.watched) if eyes is None else eyes(world)
     with PlannerProcess(work) as process:
-        done = run_in_real_time(world, ready, process, seen, seed=0)
+        done = run_in_real_time(world, context, process, seen, seed=0)
     truth = world.problem.still
     truth = truth.model_copy(update={"scene": (*truth.scene, *world.script())})
-    return done, judge(ready.setup.robot, truth, done.trajectory, goals=ready.goals), process
+    return done, judge(context.setup.robot, truth, done.trajectory, goals=context.goals), process
 
 
 def check_defined(done: RunRecord, report: RefereeReport, process: PlannerProcess) -> None:
@@ -81,7 +79,7 @@ def test_faults_of_the_planner_end_defined() -> None:
     done, report, process = go(*["raises"] * 4, *["nonsense"] * 4, *["late"] * 2, "killed")
     check_defined(done, report, process)
     why = {event.data["why"] for event in done.events if event.kind == "rejected"}
-    assert {"ValueError: a bad number", "it does not begin where the robot will be", "no answer came in time"} <= why
+    assert {"ValueError: a bad number", "it does not start where the robot will be", "no answer came in time"} <= why
     assert process.restarts and any(event.kind == "planner fault" for event in done.events)
 
 
@@ -104,7 +102,7 @@ def test_observations_may_be_late_doubled_out_of_order_or_no_numbers() -> None:
     check_defined(*go(eyes=BadEyes))
 
 
-@pytest.mark.parametrize("where", ["advance", "step", "set_out"])
+@pytest.mark.parametrize("where", ["advance", "step", "announce_start"])
 def test_an_interrupt_stops_the_robot(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
     original, left = getattr(Loop, where), [1]
 
@@ -131,17 +129,17 @@ def test_a_run_by_name_is_a_result(tmp_path: Path) -> None:
 
 
 def test_a_rehearsal_asks_for_all_sorts_of_replans_and_is_forgotten() -> None:
-    ready, asked = ready_of(PROBLEM), list[Request | str]()
+    context, asked = context_of(PROBLEM), list[Request | str]()
 
     class Noting:
-        def prepare(self, ready: Ready) -> None:
+        def prepare(self, context: RunContext) -> None:
             asked.append("prepared")
 
-        def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
+        def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
             asked.append(request)
             raise ValueError("a bad number")
 
-    rehearse(Noting(), ready)
+    rehearse(Noting(), context)
     some = [one for one in asked if isinstance(one, Request)]
     assert asked[-1] == "prepared" and len(some) == len(asked) - 1
     assert {(one.following.at_rest(0.0), math.isfinite(one.conflict)) for one in some} == {
@@ -150,20 +148,20 @@ def test_a_rehearsal_asks_for_all_sorts_of_replans_and_is_forgotten() -> None:
     assert [one.hastens for one in some].count(True) == 1
     for one in some:  # the straight line is blocked
         line = next(other.following for other in some if not other.following.at_rest(0.0))
-        assert math.isfinite(ready.first_conflict(one.predicted, line, 0.0, line.end))
+        assert math.isfinite(context.first_conflict(one.predicted, line, 0.0, line.end))
     replanner = replanner_of("apex")
-    replanner.prepare(ready)
-    before = answered(replanner, ready, some[2], Charges(0.05))
-    rehearse(replanner, ready)
-    after = answered(replanner, ready, some[2], Charges(0.05))
-    assert before.answer.charges.counts == after.answer.charges.counts
+    replanner.prepare(context)
+    before = reply_of(replanner, context, some[2], ComputeBudget(0.05))
+    rehearse(replanner, context)
+    after = reply_of(replanner, context, some[2], ComputeBudget(0.05))
+    assert before.answer.budget.counts == after.answer.budget.counts
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="processes are not kept to cores here")
 def test_the_process_keeps_to_its_core_from_the_beginning() -> None:
     """Though it was started by a thread that keeps to another one, while the executor runs."""
-    ready, world, core = ready_of(PROBLEM), world_of(PROBLEM), max(os.sched_getaffinity(0))
-    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, (), 0)
+    context, world, core = context_of(PROBLEM), world_of(PROBLEM), max(os.sched_getaffinity(0))
+    work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, (), 0)
     process = PlannerProcess(work, core)
     try:
         assert os.sched_getaffinity(process.process.pid) == {core}
@@ -173,15 +171,15 @@ def test_the_process_keeps_to_its_core_from_the_beginning() -> None:
 
 
 def test_a_process_that_cannot_be_made_ready_is_a_sentence() -> None:
-    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
-    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, replanner_of, ("apx",), 0)
+    context, world = context_of(PROBLEM), world_of(PROBLEM)
+    work = Work(world.problem.still, context.limits, context.stopping, context.settings, replanner_of, ("apx",), 0)
     with pytest.raises(PlannerProcessError, match="apx"), PlannerProcess(work):
         pass
 
 
 def test_a_process_that_dies_while_it_is_made_ready_is_a_sentence() -> None:
-    ready, world = ready_of(BLOCKED), world_of(BLOCKED)
-    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, replanner_of, ("apex",), 0)
+    context, world = context_of(BLOCKED), world_of(BLOCKED)
+    work = Work(world.problem.still, context.limits, context.stopping, context.settings, replanner_of, ("apex",), 0)
     process = PlannerProcess(work)
     process.process.kill()
     with pytest.raises(PlannerProcessError, match="died"), process:
@@ -201,9 +199,11 @@ def test_what_is_sent_late_goes_to_no_other_process(monkeypatch: pytest.MonkeyPa
             os.write(number, b"stale")
         sent.append(message)
 
-    monkeypatch.setattr(planner_process, "_sent", slow)
-    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
-    process = PlannerProcess(Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, (), 0))
+    monkeypatch.setattr(replanning, "_sent", slow)
+    context, world = context_of(PROBLEM), world_of(PROBLEM)
+    process = PlannerProcess(
+        Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, (), 0)
+    )
     process.close()
     assert sent and process.process.poll() is not None
     mine, other = multiprocessing.Pipe()
@@ -212,26 +212,26 @@ def test_what_is_sent_late_goes_to_no_other_process(monkeypatch: pytest.MonkeyPa
 
 def test_a_request_ends_what_the_process_is_busy_with() -> None:
     """The second of three requests takes its ten seconds; the third is answered at once, and ends it."""
-    ready, world = ready_of(PROBLEM, budget=10.0), world_of(PROBLEM)
-    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, ("busy", ""), 0)
-    standing = Following.standing(ready.setup.start, 0.0, ready.names)
-    begun, spent = time.monotonic(), []
+    context, world = context_of(PROBLEM, budget=10.0), world_of(PROBLEM)
+    work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, ("busy", ""), 0)
+    standing = Following.resting(context.setup.start, 0.0, context.names)
+    started, spent = time.monotonic(), []
     with PlannerProcess(work) as process:
         for number in (1, 2, 3):
             none = DynamicObstacles([])
             process.submit(Request(number, 0.0, 1.0, standing, None, none, 0.0, (), math.inf, 0))
             while number != 2 and (not spent or spent[-1].number != number):
-                assert time.monotonic() < begun + 60.0
+                assert time.monotonic() < started + 60.0
                 reply = process.reply(0.0)
                 spent += [] if reply is None else [reply]
     assert [one.number for one in spent] in ([1, 2, 3], [1, 3])
-    assert all(one.answer.found is not None for one in spent) and spent[-2].answer.charges.spent < 8.0
+    assert all(one.answer.found is not None for one in spent) and spent[-2].answer.budget.spent < 8.0
 
 
 def test_a_process_that_reads_nothing_holds_nobody_up() -> None:
-    ready, world = ready_of(PROBLEM), world_of(PROBLEM)
-    work = Work(world.problem.still, ready.limits, ready.stopping, ready.settings, Faulty, ("never",), 0)
-    standing = Following.standing(ready.setup.start, 0.0, ready.names)
+    context, world = context_of(PROBLEM), world_of(PROBLEM)
+    work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, ("never",), 0)
+    standing = Following.resting(context.setup.start, 0.0, context.names)
     large = DynamicObstacles([]).larger(0.0)
     first = Request(1, 0.0, 0.05, standing, None, large, large, (), np.inf, 0)
     with PlannerProcess(work) as process:

@@ -14,7 +14,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.referee import judge
 from apex_ompl.loop.result import Outcome
-from apex_ompl.moving.scripted import ScriptedDynamicObstacles
+from apex_ompl.moving.dynamic_obstacles import ScriptedDynamicObstacles
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there, place_at

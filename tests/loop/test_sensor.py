@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.problems.world_scripts import ScriptedWorld
+from apex_ompl.problems.world_scripts import ScriptedEnvironment
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
@@ -24,7 +24,7 @@ CUBES = (
 )
 
 
-class Watched(ScriptedWorld):
+class Watched(ScriptedEnvironment):
     """Keeps what it was asked."""
 
     def __init__(self, cubes: tuple[Obstacle, ...]) -> None:

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.loop.observation import Observation
+from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.tracking import LEAST, MOST_DOUBTED, MOST_TRACKS, Track, Tracker, TrackSettings
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
 from apex_ompl.problems.suite_robot import robot as suite_robot
@@ -260,7 +260,7 @@ def test_margins_are_eased_where_the_robot_stands(seed: int, margin: float, gap:
     tracker = tracked(look(0.0, place))
     raw = tracker.predicted(margin, "still")
     before = raw.arrays.growth.copy()
-    eased = tracker.eased(raw, q, [0.0, 0.1])
+    eased = tracker.ease_margins(raw, q, [0.0, 0.1])
     clear = clearance_in_time(KERNEL, eased, np.stack([q, q]), np.array([0.0, 0.1]), 1.0)[0]
     assert clear.min() >= LEAST - 1e-9, "what stands clear stays clear"
     assert (eased.arrays.growth >= 0.0).all() and (eased.arrays.growth <= before).all()
@@ -272,7 +272,7 @@ def test_no_margin_is_left_where_an_obstacle_touches_the_robot() -> None:
     q = suite_robot().home
     palm = suite_robot().link_pose(q, "left_hand_palm")[:3, 3]
     tracker = tracked(look(0.0, palm))
-    eased = tracker.eased(tracker.predicted(0.05), q, [0.0])
+    eased = tracker.ease_margins(tracker.predicted(0.05), q, [0.0])
     assert (eased.arrays.growth[:, 0] == 0.0).all() and (eased.arrays.growth[:, 1] > 0.0).all()
 
 

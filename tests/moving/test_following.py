@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from runs import motion_between, moved
 
-from apex_ompl.moving.following import Following, executed
+from apex_ompl.moving.context import Following, executed
 from apex_ompl.moving.stopping import stop
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.timing import Trajectory
@@ -31,7 +31,7 @@ def one() -> Following:
 
 def values(following: Following, time: float) -> np.ndarray:
     """Position, velocity and acceleration by the motion's own polynomials."""
-    m, at = following.motion, max(time - following.begin, 0.0)
+    m, at = following.motion, max(time - following.start_time, 0.0)
     if at >= m.duration:
         return np.stack([m.positions[-1], np.zeros(m.dof), np.zeros(m.dof)])
     k = max(int(np.searchsorted(m.times, at, side="right")) - 1, 0)
@@ -67,10 +67,10 @@ def test_pieces_may_begin_and_end_at_knots(knot: int) -> None:
 
 def test_states_are_those_of_the_motion_and_rest_behind_it() -> None:
     for time in np.linspace(BEGIN, BEGIN + 2 * motion().duration, 200):
-        np.testing.assert_allclose(np.stack(one().start(time)), values(one(), time), rtol=0, atol=1e-9)
+        np.testing.assert_allclose(np.stack(one().at(time)), values(one(), time), rtol=0, atol=1e-9)
         assert one().at_rest(time) == (time >= one().end - 1e-9)
     assert np.array_equal(one().state(one().end + 3.0), motion().positions[-1])
-    assert not np.stack(one().start(one().end))[1:].any()
+    assert not np.stack(one().at(one().end))[1:].any()
     assert np.array_equal(one().state(0.0), motion().positions[0]), "before it begins the robot is where it begins"
 
 
@@ -78,21 +78,21 @@ def test_states_are_those_of_the_motion_and_rest_behind_it() -> None:
 @given(shares)
 def test_a_motion_behind_another_one_joins_it(share: float) -> None:
     join = BEGIN + share * motion().duration * 0.98 + 1e-3
-    ended = stop(robot().limits, robot().joint_names, *one().start(join))
+    ended = stop(robot().limits, robot().joint_names, *one().at(join))
     then = Following(ended.trajectory, join, to_goal=True)
-    both = then.behind(one().piece(BEGIN, join), BEGIN)
-    assert both.begin == BEGIN and both.to_goal and both.end == pytest.approx(then.end, abs=1e-9)
+    both = then.after(one().piece(BEGIN, join), BEGIN)
+    assert both.start_time == BEGIN and both.to_goal and both.end == pytest.approx(then.end, abs=1e-9)
     check(both.motion, lambda t: values(one() if t < join else then, t), BEGIN, then.end)
 
 
 @settings(max_examples=20)
 @given(st.lists(st.integers(0, 120), min_size=1, max_size=5, unique=True))
 def test_what_was_executed_is_what_was_followed(ticks: list[int]) -> None:
-    standing = Following.standing(robot().home, 0.0, robot().joint_names)
+    standing = Following.resting(robot().home, 0.0, robot().joint_names)
     followed = [(0.0, standing), (0.3, Following(motion(), 0.3))]
     for tick in sorted(ticks):  # a stop from wherever the robot is, and another one from that
         time = 0.3 + 0.01 * tick
-        ended = stop(robot().limits, robot().joint_names, *followed[-1][1].start(time)).trajectory
+        ended = stop(robot().limits, robot().joint_names, *followed[-1][1].at(time)).trajectory
         followed.append((time, Following(ended, time)))
     end = followed[-1][1].end + 0.25
     found = executed(followed, end)
@@ -115,9 +115,9 @@ def test_motions_shorter_than_a_tick() -> None:
     assert 0.0 < short.duration < 0.01
     following = Following(short, 0.02)
     check(following.piece(0.02, 0.03), lambda t: values(following, t), 0.02, 0.03)
-    found = executed([(0.0, Following.standing(home, 0.0, names)), (0.02, following)], 0.05)
+    found = executed([(0.0, Following.resting(home, 0.0, names)), (0.02, following)], 0.05)
     assert found.duration == pytest.approx(0.05) and np.array_equal(found.positions[-1], there)
-    still = Following.standing(home, 1.0, names)
+    still = Following.resting(home, 1.0, names)
     assert still.end == 1.0 and still.at_rest(1.0) and np.array_equal(still.piece(1.0, 1.01).positions, [home, home])
     nothing = executed([(0.0, still)], 0.0)
     assert nothing.duration == 0.0 and np.array_equal(nothing.positions, [home])

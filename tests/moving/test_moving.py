@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from crossings import path_from_home, problem_with
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
-from apex_ompl.moving.swept import check_timed_path, constant_velocity_times, inflated
+from apex_ompl.moving.timed_proof import check_timed_path, constant_velocity_times, inflated
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.scene.scripts import obstacle_at
 
 SHAPES = [
     {"box": (0.12, 0.1, 0.08)}, {"sphere": {"radius": 0.06}}, {"cylinder": {"radius": 0.05, "length": 0.15}},
     {"capsule": {"radius": 0.05, "length": 0.1}},
 ]  # fmt: skip
-
-
-def problem_with(robot: Robot, *scene: Obstacle) -> Problem:
-    home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
-    return Problem(name="moving", robot=robot.name, scene=scene, start=home, goal=Goal(joints=(home,)))
-
-
-def path_from_home(robot: Robot, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    path = robot.home + np.cumsum(rng.normal(0.0, 0.12, (4, robot.dof)), axis=0)
-    path = np.clip(path, robot.limits.lower, robot.limits.upper)
-    return path, constant_velocity_times(robot, path, 0.5)
 
 
 @settings(max_examples=20)

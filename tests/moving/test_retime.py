@@ -13,8 +13,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, prove_motion
-from apex_ompl.moving.retime import retime
-from apex_ompl.moving.safe_intervals import Blocked, blocked
+from apex_ompl.moving.retime import Blocked, blocked, retime
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle
@@ -99,7 +98,7 @@ def test_random_crossings(kernel: Kernel, robot: Robot, speed: float, seed: int)
         if dynamic is None or not prove_motion(kernel, dynamic, motion, time, motion.duration + HOLD):
             continue
         edges = np.linspace(time, motion.duration, PIECES + 1)
-        within = {"begin": time, "end": time + HORIZON + HOLD}
+        within = {"start": time, "end": time + HORIZON + HOLD}
         ends = (np.full((1, 2), t) for t in (time, motion.duration))
         start, end = (blocked(kernel, dynamic, motion, place, **within) for place in ends)
         pieces = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), **within)

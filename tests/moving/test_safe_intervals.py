@@ -10,7 +10,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.compiled.moving.blocked_intervals import MOST_SPANS
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.safe_intervals import Blocked, blocked
+from apex_ompl.moving.retime import Blocked, blocked
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at
@@ -52,7 +52,7 @@ def test_states_are_blocked_when_spheres_meet_dynamic_obstacles(
             continue
         dynamic.update("dynamic_obstacle", stamp=float(rng.choice([-0.5, 0.0, 2.0])))
         where = np.sort(rng.uniform(0.0, motion.duration, 3))
-        found = blocked(kernel, dynamic, motion, np.stack([where, where], axis=1), begin=0.0, end=HORIZON)
+        found = blocked(kernel, dynamic, motion, np.stack([where, where], axis=1), start=0.0, end=HORIZON)
         for place, state in enumerate(motion(where)):
             clearance = clearance_in_time(kernel, dynamic, np.tile(state, (len(times), 1)), times)[0]
             inside = is_blocked(found, place, times)
@@ -76,7 +76,7 @@ def test_pieces_are_blocked_when_any_of_their_states_is(kernel: Kernel, robot: R
             continue
         edges = np.linspace(0.0, motion.duration, 65)
         places = np.stack([edges[:-1], edges[1:]], axis=1)
-        found = blocked(kernel, dynamic, motion, places, begin=0.0, end=HORIZON, slack=slack)
+        found = blocked(kernel, dynamic, motion, places, start=0.0, end=HORIZON, slack=slack)
         count = 4000
         where, times = rng.uniform(0.0, motion.duration, count), rng.uniform(0.0, HORIZON, count)
         states = motion(where) + rng.uniform(-slack, slack, (count, robot.dof))
@@ -97,9 +97,9 @@ def test_a_piece_adds_little_to_the_intervals_of_its_states(kernel: Kernel, robo
         if dynamic is None:
             continue
         edges = np.linspace(0.0, motion.duration, 257)
-        found = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), begin=0.0, end=HORIZON)
+        found = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), start=0.0, end=HORIZON)
         middles = (edges[:-1] + edges[1:]) / 2.0
-        states = blocked(kernel, dynamic, motion, np.stack([middles, middles], axis=1), begin=0.0, end=HORIZON)
+        states = blocked(kernel, dynamic, motion, np.stack([middles, middles], axis=1), start=0.0, end=HORIZON)
         long, short = (
             np.array([np.diff(b.spans[p, : b.counts[p]], axis=1).sum() for p in range(256)]) for b in (found, states)
         )
@@ -116,7 +116,7 @@ def test_states_are_blocked_when_meshes_touch_dynamic_obstacles(kernel: Kernel, 
         if dynamic_obstacle is None:
             continue
         dynamic, place = DynamicObstacles([dynamic_obstacle]), np.full((1, 2), rng.uniform(0.3, 0.8) * motion.duration)
-        found, state = blocked(kernel, dynamic, motion, place, begin=0.0, end=HORIZON), motion(place[0, 0])
+        found, state = blocked(kernel, dynamic, motion, place, start=0.0, end=HORIZON), motion(place[0, 0])
         checker = CollisionChecker(robot, [dynamic_obstacle])
         near = clearance_in_time(kernel, dynamic, np.tile(state, (len(times), 1)), times)[0] <= 0.0
         for time in rng.permutation(times[near])[:100]:
@@ -133,5 +133,5 @@ def test_far_dynamic_obstacles_block_nothing(kernel: Kernel, robot: Robot) -> No
         [Obstacle(name="dynamic_obstacle", box=(0.1, 0.1, 0.1), position=(0.0, 0.0, 5.0), velocity=(0.0, 0.2, 0.0))]
     )
     edges = np.linspace(0.0, motion.duration, 33)
-    found = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), begin=0.0, end=HORIZON)
+    found = blocked(kernel, dynamic, motion, np.stack([edges[:-1], edges[1:]], axis=1), start=0.0, end=HORIZON)
     assert not found.counts.any()

@@ -11,8 +11,7 @@ from apex_ompl import MotionPlanner, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.evaluation import Row, bench
-from apex_ompl.moving.swept import check_timed_path
-from apex_ompl.moving.timed_proof import TimedProver
+from apex_ompl.moving.timed_proof import TimedProver, check_timed_path
 from apex_ompl.planning import among_dynamic_obstacles
 from apex_ompl.planning.among_dynamic_obstacles import MARGIN
 from apex_ompl.problems import load

@@ -84,7 +84,7 @@ def test_a_plan_reads_as_the_command_line_prints_it(apex_cli, problem: Problem, 
 
 
 def test_a_run_reads_as_the_command_line_prints_it(apex_cli, run: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_command, "run_loop", lambda *_, **__: run)
+    monkeypatch.setattr(run_command.api, "run", lambda *_, **__: run)
     done = apex_cli("run", "popup/vertical/large/12")
     assert done.stdout == f"{run}\n" and done.returncode == 0
     assert str(run).splitlines()[0] == "by-hand: reached"

@@ -16,14 +16,14 @@ from apex_ompl.planning.planner import PlanKeywords, PlanOptions, ProblemKeyword
 from apex_ompl.planning.world import ObstacleFields
 
 SOURCES = (
-    "api.py", "loop/run.py", "planning/planner.py", "planning/world.py", "apex/planner.py", "apex/parameters.py",
+    "api.py", "planning/planner.py", "planning/world.py", "apex/planner.py", "apex/parameters.py",
     "ompl/parameters.py",
 )  # fmt: skip
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/schema.py")
 USE = """
+from apex_ompl.api import run
 from apex_ompl.api import plan
 from apex_ompl.apex.planner import APEX
-from apex_ompl.loop.run import run
 from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.planning.planner import MotionPlanner
 

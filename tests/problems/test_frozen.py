@@ -15,7 +15,7 @@ from support import ROOT
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError, UnknownNameError
-from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.moving.timed_proof import check_timed_path
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import resample
 from apex_ompl.problems import frozen

@@ -18,7 +18,7 @@ from apex_ompl.problems.alignment import SIZES
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.problems.world_ambushes import moment_of
 from apex_ompl.problems.world_robot import BASE_REACH, BASES, RobotPlaces, base_entry, cube
-from apex_ompl.problems.worlds import World
+from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at, place_at
@@ -45,7 +45,7 @@ def straight(problem_name: str, pace: float) -> Trajectory:
     return motion
 
 
-def first_motion(world: World, pace: float = 0.25) -> Trajectory:
+def first_motion(world: DynamicEnvironment, pace: float = 0.25) -> Trajectory:
     return straight(world.problem.name, pace)
 
 
@@ -55,20 +55,20 @@ def state(motion: Trajectory, time: float) -> Array:
 
 
 def run(
-    world: World, motion: Trajectory, seconds: float, step: float = STEP
+    world: DynamicEnvironment, motion: Trajectory, seconds: float, step: float = STEP
 ) -> list[tuple[float, tuple[Obstacle, ...]]]:
     """Follow the motion, and return what was there at each step."""
     seen, begun = [], False
     for time in np.arange(0.0, seconds, step).tolist():
         if time >= BEGIN and not begun:
-            world.begin(motion, BEGIN)
+            world.start(motion, BEGIN)
             begun = True
         world.advance(time, state(motion, time))
         seen.append((time, world.present(time)))
     return seen
 
 
-def check_consistency(world: World, seen: list[tuple[float, tuple[Obstacle, ...]]]) -> None:
+def check_consistency(world: DynamicEnvironment, seen: list[tuple[float, tuple[Obstacle, ...]]]) -> None:
     """The script says what was there, and nothing was faster than it may be."""
     script = {o.name: o for o in world.script()}
     last: dict[str, tuple[float, Array]] = {}
@@ -87,7 +87,7 @@ def check_consistency(world: World, seen: list[tuple[float, tuple[Obstacle, ...]
         assert Obstacle.model_validate(o.model_dump()) == o
 
 
-def exact(world: World, *cubes: Obstacle) -> CollisionChecker:
+def exact(world: DynamicEnvironment, *cubes: Obstacle) -> CollisionChecker:
     return CollisionChecker(robot(), [*world.problem.scene, *cubes], world.problem.attached)
 
 
@@ -200,7 +200,7 @@ def test_time_does_not_go_back(kind: str) -> None:
     world = worlds.load(f"{kind}/vertical/small/1")
     motion = first_motion(world)
     world.advance(1.0, motion(0.0))
-    for call in (lambda: world.advance(0.9, motion(0.0)), lambda: world.begin(motion, 0.9)):
+    for call in (lambda: world.advance(0.9, motion(0.0)), lambda: world.start(motion, 0.9)):
         with pytest.raises(ParameterError, match="time"):
             call()
 
@@ -268,7 +268,7 @@ def test_popups_wait_until_there_is_room() -> None:
     run(world, motion, motion.duration)
     (made,) = world.script()
     again, place = worlds.load("popup/vertical/medium/3"), made.position
-    again.begin(motion, BEGIN)
+    again.start(motion, BEGIN)
     away = robot().home
     places = RobotPlaces(again.problem)
     inside = next(
@@ -303,7 +303,7 @@ def test_few_interceptors_find_no_way() -> None:
     made = []
     for name in worlds.ids("interceptor", "train", 40):
         world = worlds.load(name)
-        world.begin(first_motion(world), 0.0)
+        world.start(first_motion(world), 0.0)
         made.append(len(world.present(0.0)))
     assert np.mean(made) > 0.8
 

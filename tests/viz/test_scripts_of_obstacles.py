@@ -9,11 +9,11 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from crossings import path_from_home, problem_with
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image, ImageSequence
 from small_arm import arm_problem
-from test_moving import path_from_home, problem_with
 
 from apex_ompl import plan
 from apex_ompl.cli import main
@@ -21,7 +21,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import run as bench_run
-from apex_ompl.moving.swept import check_timed_path
+from apex_ompl.moving.timed_proof import check_timed_path
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.planning import MotionPlanner
 from apex_ompl.result import PlanResult

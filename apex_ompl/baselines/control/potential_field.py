@@ -9,32 +9,32 @@ import numpy as np
 
 from apex_ompl.baselines.control.short_horizon import Horizon, finish, first_proved
 from apex_ompl.kernel import Kernel
-from apex_ompl.moving.charges import Charges
+from apex_ompl.moving.compute_costs import ComputeBudget
+from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.ready import Ready
-from apex_ompl.moving.request import Answer, Request
+from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
 from apex_ompl.moving.search import Search
 from apex_ompl.types import Array
 
-LEAST = 0.25  # clearance below which the potential goes on with the slope that it has there, as a share of the reach
+LEAST = 0.25  # clearance below which the potential is linear, as a share of the reach
 
 
 class Field(NamedTuple):
-    """A potential in joint space: towards a goal, and away from what is near (Khatib 1986).
+    """A potential in joint space: attracted by a goal, repelled by obstacles (Khatib 1986).
 
-    The attractive part is ``attraction * |q - goal|^2 / 2``, which goes on as a cone beyond ``cone``. The repulsive
-    parts are ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: of obstacles that move, of what
-    stands still, and of the robot to itself. The last two fade with the square of the distance to the goal inside the
+    The attractive part is ``attraction * |q - goal|^2 / 2``, and a cone beyond the distance ``cone``. The repulsive
+    parts are ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: to dynamic obstacles, to static
+    obstacles, and of the robot to itself. The last two fade with the square of the distance to the goal inside the
     cone, so that a goal close to contact is a minimum (Ge and Cui 2000).
 
     Attributes:
         goal: Shape (dof,).
         attraction: Gain [1/s^2].
-        cone: Distance to the goal from which on its force is constant [rad].
-        repulsion: Gain for obstacles that move [rad^2/s^2].
-        own_repulsion: Gain for what stands still and the robot itself [rad^2/s^2].
-        reach: Clearance to obstacles that move below which they repel [m].
-        own_reach: The same of what stands still and of the robot itself [m].
+        cone: Distance to the goal beyond which its force is constant [rad].
+        repulsion: Gain for dynamic obstacles [rad^2/s^2].
+        own_repulsion: Gain for static obstacles and the robot itself [rad^2/s^2].
+        reach: Clearance to dynamic obstacles below which they repel [m].
+        own_reach: Clearance to static obstacles and of the robot to itself below which they repel [m].
     """
 
     goal: Array
@@ -51,8 +51,8 @@ class Field(NamedTuple):
         """Return the potential [rad^2/s^2] at a state, shape (dof,), and its force, shape (dof,) [rad/s^2].
 
         Args:
-            kernel: The robot among what stands still.
-            dynamic: The obstacles that move.
+            kernel: The robot among static obstacles.
+            dynamic: The dynamic obstacles.
             q: The state.
             time: Time of the dynamic obstacles' stamps [s].
         """
@@ -77,7 +77,7 @@ class Field(NamedTuple):
 
 
 def repulsive(share: float) -> tuple[float, float]:
-    """Return (1 / share - 1)^2 / 2, and by how much it falls with the share; below ``LEAST`` on the tangent there."""
+    """Return (1 / share - 1)^2 / 2 and its negative derivative by the share; below ``LEAST``, of the tangent there."""
     at = max(share, LEAST)
     steepness = (1.0 / at - 1.0) / at**2
     return 0.5 * (1.0 / at - 1.0) ** 2 + steepness * (at - share), steepness
@@ -85,24 +85,24 @@ def repulsive(share: float) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class PotentialField:
-    """A reflex: the way down an artificial potential (Khatib 1986) with damping, over a short horizon.
+    """A reflex: damped descent of an artificial potential (Khatib 1986) over a short horizon.
 
-    Obstacles repel from where they are expected when the robot is there. The horizon, or a part of it, is followed by a
-    stop and proved. There is no way out of local minima. Ten sets of parameters were tried in 4 to 8
-    worlds of each of the kinds ``moving`` and ``popup`` of the validation split.
+    Obstacles repel from their predicted places at the time of each step. The horizon, or a part of it, is followed by a
+    stop and proved. There is no escape from local minima. Ten sets of parameters were tried in 4 to 8 worlds of each of
+    the kinds ``moving`` and ``popup`` of the validation split.
 
     Attributes:
-        steps: Number of steps of the horizon, the stop at its end among them.
+        steps: Number of steps of the horizon, including the stop at its end.
         step: Time of a step [s].
-        damping: Of the speed [1/s].
-        attraction: See :class:`Field`.
-        cone: Likewise.
-        repulsion: Likewise.
-        own_repulsion: Likewise.
-        reach: Likewise.
-        own_reach: Likewise.
-        counts: Numbers of steps of which a proof is tried.
-        near: Distance of any joint to a goal from which on the straight motion to it is tried first [rad].
+        damping: Damping of the speed [1/s].
+        attraction: Gain of the attraction, see :class:`Field` [1/s^2].
+        cone: Distance to the goal beyond which its force is constant [rad].
+        repulsion: Gain of the repulsion by dynamic obstacles [rad^2/s^2].
+        own_repulsion: Gain of the repulsion by static obstacles and by the robot itself [rad^2/s^2].
+        reach: Clearance to dynamic obstacles below which they repel [m].
+        own_reach: Clearance to static obstacles and of the robot to itself below which they repel [m].
+        counts: Numbers of steps for which a proof is tried.
+        near: Distance to a goal, of the farthest joint, below which the straight motion to it is tried first [rad].
     """
 
     steps: int = 14
@@ -117,19 +117,19 @@ class PotentialField:
     counts: tuple[int, ...] = (14, 8)
     near: float = 0.5
 
-    def prepare(self, ready: Ready) -> None:
+    def prepare(self, context: RunContext) -> None:
         """Nothing is needed."""
 
-    def replan(self, ready: Ready, request: Request, charges: Charges) -> Answer:
-        """Return the motion down the potential, or a straight one to a goal that is near."""
-        search = Search(ready, request, charges)
+    def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
+        """Return the motion down the potential, or a straight one to a near goal."""
+        search = Search(context, request, budget)
         if not len(search.goals):
-            return Answer(None, "", charges)
+            return Answer(None, "", budget)
         motion, part = finish(search, self.near), "finish"
         if motion is None:
-            horizon = Horizon(ready.limits, self.step)
+            horizon = Horizon(context.limits, self.step)
             motion, part = first_proved(search, horizon, self.controls(search, horizon), self.counts), "field"
-        return Answer(None if motion is None else search.following(motion), part, charges)
+        return Answer(None if motion is None else search.following(motion), part, budget)
 
     def field(self, goal: Array) -> Field:
         """Return the potential with a goal, shape (dof,)."""
@@ -137,15 +137,18 @@ class PotentialField:
 
     def controls(self, search: Search, horizon: Horizon) -> Array:
         """Return the accelerations down the potential, shape (K, dof) [rad/s^2]."""
-        ready, request = search.ready, search.request
-        field, fingers = self.field(search.goals[0]), ready.fingers
+        context, request = search.context, search.request
+        field, fingers = self.field(search.goals[0]), context.fingers
 
         def control(k: int, speed: Array, at: Array) -> Array:
             time = request.join + (k + 1) * self.step
-            _, force = field.potential_and_force(ready.kernel, request.predicted, at[0], time)
+            _, force = field.potential_and_force(context.kernel, request.predicted, at[0], time)
             force[fingers] = 0.0
-            search.charges.charge("force")
+            search.budget.spend("force")
             return force - self.damping * speed
 
         points = horizon.steer(search.start, (self.steps, 1), control)
         return horizon.applied(points)[:, 0]
+
+
+register("potential-field", PotentialField, "a reflex down an artificial potential", ONE_PLAN)

@@ -1,9 +1,9 @@
-"""Motions over a short horizon: what a control does in steps, as a spline in time that ends at rest.
+"""Motions over a short horizon: the steps of a control as a spline in time that ends at rest.
 
 The states of the steps are the control points P_k of a uniform cubic B-spline in time with knots one step h apart.
 Its velocities are averages of the speeds (P_k+1 - P_k) / h, its accelerations averages of their changes over h, and its
-jerks changes of these over h. So a rollout whose speeds and accelerations are kept within limits is a motion that keeps
-them, too; the acceleration is at most half the jerk limit times h, so that jerks keep theirs.
+jerks changes of these over h. So a rollout whose speeds and accelerations keep the limits is a motion that keeps them,
+too; the acceleration is at most half the jerk limit times h, so that jerks keep theirs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from apex_ompl.moving.search import Search, least_duration
+from apex_ompl.moving.search import Search, shortest_duration
 from apex_ompl.moving.timed_spline import Start, TimedSpline
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory, time_path
@@ -23,12 +23,12 @@ from apex_ompl.types import Array
 
 Control = Callable[[int, Array, Array], Array]
 STRAIGHT = 32  # states of a straight motion
-STRETCHES, SLOWER = 12, 1.05  # changes of the duration of a straight motion that begins while moving, and their least
+STRETCHES, SLOWER = 12, 1.05  # changes of the duration of a straight motion that starts while moving, and their least
 
 
 @dataclass(frozen=True, eq=False)
 class Horizon:
-    """Steps of a control, each a change of speed, cut off at the limits.
+    """Steps of a control, each a change of speed, clipped to the limits.
 
     Attributes:
         limits: Limits of the joints.
@@ -51,14 +51,14 @@ class Horizon:
         """Return the states that a control leads to, at rest in the end.
 
         Args:
-            start: What the robot does at first.
+            start: State in which the motion starts.
             shape: Number K of steps, and number N of rollouts.
-            control: Returns the accelerations that are wanted at a step, shape (N, dof) [rad/s^2], from its number, the
-                speeds, and the states.
+            control: Returns the wanted accelerations at a step, shape (N, dof) [rad/s^2], from its number, the speeds,
+                and the states.
 
         Returns:
-            Control points, shape (K + 3, N, dof) [rad]: the first three say how the motion begins; number k is about
-            where the robot is at time (k - 1) h. The last two are the same.
+            Control points, shape (K + 3, N, dof) [rad]: the first three fix the start of the motion; number k is near
+            the state at time (k - 1) h. The last two are the same.
         """
         count, rollouts = shape
         points = np.empty((count + 3, rollouts, len(start.position)))
@@ -69,7 +69,7 @@ class Horizon:
             wanted = self._keeping(speed + self.step * control(k, speed, at), at, count - 1 - k)
             low, high = bounds if k == 0 else (-self.most, self.most)
             points[k + 3] = at + self.step * np.clip(wanted, speed + self.step * low, speed + self.step * high)
-        points[-1] = points[-2]  # but for rounding they are the same
+        points[-1] = points[-2]  # they are the same except for rounding
         return points
 
     def applied(self, points: Array) -> Array:
@@ -108,18 +108,18 @@ class Horizon:
 
 
 def first_proved(search: Search, horizon: Horizon, controls: Array, counts: tuple[int, ...]) -> Trajectory | None:
-    """Return the motion of the first controls and then a stop, of the first count of controls that is proved.
+    """Return the motion by the first controls and a stop, for the first number of controls that is proved, or None.
 
     Args:
         search: The replan.
         horizon: The steps.
         controls: Accelerations, shape (K, dof) [rad/s^2].
-        counts: Numbers of steps that are tried, the stop among them.
+        counts: Numbers of steps that are tried, including the stop.
     """
     for count in counts:
         points = horizon.roll(search.start, controls[:count, None])[:, 0]
-        motion = horizon.motion(search.start, points, search.ready.names)
-        search.charges.charge("short motion")
+        motion = horizon.motion(search.start, points, search.context.names)
+        search.budget.spend("short motion")
         if search.accepts(motion):
             return motion
     return None
@@ -137,8 +137,8 @@ def finish(search: Search, near: float) -> Trajectory | None:
 
 def straight(search: Search, goal: Array) -> Trajectory | None:
     """Return the straight motion to a state, or None where there is none within the limits from a moving start."""
-    start, limits, names = search.start, search.ready.limits, search.ready.names
-    search.charges.charge("straight motion")
+    start, limits, names = search.start, search.context.limits, search.context.names
+    search.budget.spend("straight motion")
     if not (start.velocity.any() or start.acceleration.any()):
         return time_path(np.stack([start.position, goal]), limits, names).trajectory
     return _stretched(search, np.linspace(start.position, goal, STRAIGHT), goal)
@@ -148,21 +148,21 @@ def along(search: Search, states: Array, goal: Array) -> Trajectory | None:
     """Return the motion whose spline has some states as control points and ends in one, or None within the limits.
 
     Args:
-        search: The replan, which says how the motion begins.
+        search: The replan, with the state in which the motion starts.
         states: States of the motion, evenly spaced in time, shape (N, dof).
         goal: Where it ends, shape (dof,).
     """
-    search.charges.charge("straight motion")
+    search.budget.spend("straight motion")
     return _stretched(search, states, goal)
 
 
 def _stretched(search: Search, states: Array, goal: Array) -> Trajectory | None:
-    """Return the spline along states that takes as long as the limits ask for, or None where that is not found."""
-    limits = search.ready.limits
-    spline = TimedSpline.along(states, least_duration(states, limits), search.start, goal)
+    """Return the spline along states with the duration that the limits require, or None where it is not found."""
+    limits = search.context.limits
+    spline = TimedSpline.along(states, shortest_duration(states, limits), search.start, goal)
     for _ in range(STRETCHES):
         least = least_knot_spacing(spline.control, limits)
         if least <= spline.spacing:
-            return spline.trajectory(search.ready.names)
+            return spline.trajectory(search.context.names)
         spline = spline.lasting(max(least, SLOWER * spline.spacing))
     return None

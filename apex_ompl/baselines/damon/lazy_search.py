@@ -8,25 +8,28 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.baselines.drrt.goal_tree import AreFree
+from apex_ompl.baselines.drrt.dynamic_rrt import AreFree
 from apex_ompl.kernel import search
 from apex_ompl.types import Array, Flags, Indices
+
+Motion = tuple[str, int, int]
+"""A motion of a search: ``start`` or ``goal``, its number, and a node; or ``edge``, its number, and its twin's."""
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """An undirected graph of states; each edge is stored in both directions, by the node that it begins at.
+    """An undirected graph of states; each edge is stored in both directions, by the node that it starts at.
 
     Attributes:
         states: States of the nodes, shape (N, dof).
-        begins: First edge of each node, shape (N + 1,).
+        first_edges: First edge of each node, shape (N + 1,).
         ends: Node that each edge leads to, shape (E,).
         twins: The same edge in the other direction, shape (E,).
         lengths: Euclidean length of each edge, shape (E,) [rad].
     """
 
     states: Array
-    begins: Indices
+    first_edges: Indices
     ends: Indices
     twins: Indices
     lengths: Array
@@ -43,14 +46,14 @@ class Graph:
         both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
         keys = np.unique(both[both[:, 0] != both[:, 1]] @ np.array([count, 1]))
         first, ends = np.divmod(keys, count)
-        begins = np.searchsorted(first, np.arange(count + 1))
+        first_edges = np.searchsorted(first, np.arange(count + 1))
         twins = np.searchsorted(keys, ends * count + first)
-        return cls(states, begins, ends, twins, np.linalg.norm(states[ends] - states[first], axis=1))
+        return cls(states, first_edges, ends, twins, np.linalg.norm(states[ends] - states[first], axis=1))
 
     @property
     def firsts(self) -> Indices:
-        """Node that each edge begins at, shape (E,)."""
-        return np.repeat(np.arange(len(self.states)), np.diff(self.begins))
+        """Node that each edge starts at, shape (E,)."""
+        return np.repeat(np.arange(len(self.states)), np.diff(self.first_edges))
 
 
 class _Found(NamedTuple):
@@ -60,10 +63,6 @@ class _Found(NamedTuple):
     nodes: list[int]
     edges: list[int]
     goal: int
-
-
-Motion = tuple[str, int, int]
-"""A motion of a search: ``start`` or ``goal``, its number, and a node; or ``edge``, its number, and its twin's."""
 
 
 class LazySearch:
@@ -83,7 +82,7 @@ class LazySearch:
     def __init__(
         self, graph: Graph, usable: Flags, starts: Array, goals: Array, *, free_nodes: Flags | None = None
     ) -> None:  # fmt: skip
-        """Begin with all edges between nodes that may be used.
+        """Start with all edges between nodes that may be used.
 
         Args:
             graph: The graph.
@@ -104,7 +103,7 @@ class LazySearch:
         self._entry, self._leave = np.full((len(starts), count), np.inf), np.full((len(goals), count), np.inf)
         away = [np.linalg.norm(graph.states - goal, axis=1) for goal in goals]
         self._heuristic = np.min(away, axis=0)
-        self._shortest = search.GraphSearch(search.Graph(graph.begins, graph.ends, graph.lengths))
+        self._shortest = search.GraphSearch(search.Graph(graph.first_edges, graph.ends, graph.lengths))
 
     def connect(self, start: int | None = None, goal: int | None = None, *, nodes: Indices) -> None:
         """Let the path enter the graph from a start, or leave it for a goal, given by number, over some nodes.
@@ -178,7 +177,7 @@ class LazySearch:
         self._hit[left[~free]] = True
         for k in left[~free]:
             self._entry[:, k] = self._leave[:, k] = np.inf
-            out = np.arange(self.graph.begins[k], self.graph.begins[k + 1])
+            out = np.arange(self.graph.first_edges[k], self.graph.first_edges[k + 1])
             self._usable[out] = self._usable[self.graph.twins[out]] = 0
         return bool(free.all())
 

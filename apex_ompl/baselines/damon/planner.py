@@ -12,8 +12,8 @@ from ompl import base as ob
 
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.start_goal import read_goals, read_starts
+from apex_ompl.baselines.damon.latent_graph import Damon
 from apex_ompl.baselines.damon.manifold import shared_manifold
-from apex_ompl.baselines.damon.queries import Damon
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.parameters import Parameters, bounded, one_of, register
@@ -24,12 +24,12 @@ from apex_ompl.types import Array, Flags
 
 NAME = "damon"
 Status = ob.PlannerStatus
-DEEP = 0.03  # overlap of spheres beyond which a node counts as in contact without a look at exact shapes [m]
-SEEN = 0.001  # clearances beyond this are not told apart [m]
+DEEP = 0.03  # overlap of spheres beyond which a node counts as in contact without a check by exact shapes [m]
+SEEN = 0.001  # largest clearance that is computed [m]
 
 
 class DAMON(OwnPlanner):
-    """OMPL planner: :class:`apex_ompl.baselines.damon.queries.Damon` by the validators of the space information.
+    """OMPL planner: :class:`apex_ompl.baselines.damon.latent_graph.Damon` by the validators of the space information.
 
     Every motion of a path is checked by the motion validator; nothing is random. The graph is finite, so that ``solve``
     may end before its time without a path. In the closed loop it is the method ``damon``.
@@ -55,7 +55,7 @@ class DAMON(OwnPlanner):
         before, self.validator = self.validator, self.validator.current()
         if self.validator is not before:
             self._hit.clear()
-        begin, inputs, dof = time.perf_counter(), self.getPlannerInputStates(), self.validator.checker.robot.dof
+        started, inputs, dof = time.perf_counter(), self.getPlannerInputStates(), self.validator.checker.robot.dof
         starts = read_starts(inputs, dof)
         goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
         if not starts:
@@ -79,7 +79,7 @@ class DAMON(OwnPlanner):
             self.report.reason += " in the time given" if ptc() else ", and none is left"
             return Status.TIMEOUT
         self.report.solved_by = NAME
-        self.report.add_solution(self, Path(path), time.perf_counter() - begin)
+        self.report.add_solution(self, Path(path), time.perf_counter() - started)
         return Status.EXACT_SOLUTION
 
     def _nodes(self, states: Array) -> tuple[Flags, Flags]:

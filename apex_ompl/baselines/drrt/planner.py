@@ -12,8 +12,7 @@ from ompl import base as ob
 from ompl import util as ou
 
 from apex_ompl.apex.start_goal import read_goals, read_starts
-from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT
-from apex_ompl.baselines.drrt.goal_tree import GoalTree
+from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT, GoalTree
 from apex_ompl.collision.path_proof import may_have_become_blocked
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.own_planner import OwnPlanner, Tree
@@ -62,11 +61,11 @@ class DRRT(OwnPlanner):
         self._solves, self._trimmed = 0, None
 
     def clearQuery(self) -> None:  # noqa: N802 - OMPL's name
-        """Keep the tree, which is of use as long as the goals are the same."""
+        """Keep the tree, which stays useful as long as the goals are the same."""
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.removed = 0
-        si, begin = self.getSpaceInformation(), time.perf_counter()
+        si, started = self.getSpaceInformation(), time.perf_counter()
         dof, inputs = int(si.getStateDimension()), self.getPlannerInputStates()
         starts = read_starts(inputs, dof)
         goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
@@ -80,7 +79,7 @@ class DRRT(OwnPlanner):
         rng, box = np.random.default_rng(first + self._solves), si.getStateSpace().getBounds()
         self._solves += 1
         lower, upper = np.array(box.low), np.array(box.high)
-        tree = self.search.begin(np.stack(goals))
+        tree = self.search.rooted_at(np.stack(goals))
         with self.report.timed("trim"):
             self._trim(tree)
         with self.report.timed("grow"):
@@ -92,7 +91,7 @@ class DRRT(OwnPlanner):
             self.report.reason = f"no path by a tree of {len(tree)} nodes in the time given"
             return Status.TIMEOUT
         self.report.solved_by = NAME
-        self.report.add_solution(self, Path(path), time.perf_counter() - begin)
+        self.report.add_solution(self, Path(path), time.perf_counter() - started)
         return Status.EXACT_SOLUTION
 
     def _trim(self, tree: GoalTree) -> None:

@@ -1,4 +1,4 @@
-"""Gaussian-process prior of motions whose acceleration is white noise: constant velocity, but for noise.
+"""Gaussian-process prior of motions with white noise on the acceleration (constant velocity without noise).
 
 The state x = (q, v) of a joint follows the linear stochastic differential equation
 
@@ -22,10 +22,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.baselines.gpmp.block_tridiagonal import BlockTridiagonal
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_integer, check_positive
 
@@ -76,16 +76,16 @@ class GaussianProcess:
         return np.array([[12.0 / t**3, -6.0 / t**2], [-6.0 / t**2, 4.0 / t]]) / self.power
 
     def interpolation(self, time: float) -> tuple[Array, Array]:
-        """Return Lambda(t) and Psi(t), shape (2, 2) each, of a time behind a support [s]."""
+        """Return Lambda(t) and Psi(t), shape (2, 2) each, of a time after a support [s]."""
         psi = self.covariance(time) @ self.transition(self.spacing - time).T @ self.precision
         return self.transition(time) - psi @ self.transition(self.spacing), psi
 
     def weights(self, count: int) -> Array:
-        """Return the weights of ``count`` states of an interval, its first support and evenly spaced ones behind it.
+        """Return the weights of ``count`` states of an interval, its first support and evenly spaced ones after it.
 
         Returns:
             Shape (count, 2, 2, 2): of a state; whether of its position or velocity; of the support before it or the one
-            behind it; whether of the position or the velocity there.
+            after it; whether of the position or the velocity there.
         """
         pairs = [self.interpolation(self.spacing * k / count) for k in range(count)]
         return np.stack([np.stack(pair, axis=1) for pair in pairs])
@@ -173,3 +173,51 @@ class GaussianProcess:
         inner = mean[1:-1]
         drawn = np.asarray(size / spread * root) @ rng.normal(size=(2 * len(inner), inner.shape[2]))
         return np.concatenate([mean[:1], inner + drawn.reshape(inner.shape), mean[-1:]])
+
+
+class BlockTridiagonal(NamedTuple):
+    """A symmetric matrix A of n x n blocks of b x b, zero but for its diagonal blocks D_i and their neighbors.
+
+    Attributes:
+        diagonal: Diagonal blocks D_i = A_i,i, symmetric, shape (n, b, b).
+        upper: Blocks U_i = A_i,i+1, shape (n - 1, b, b); A_i+1,i is their transpose.
+    """
+
+    diagonal: Array
+    upper: Array
+
+    def dense(self) -> Array:
+        """Return the matrix, shape (n b, n b)."""
+        n, b, _ = self.diagonal.shape
+        found = np.zeros((n, b, n, b))
+        for i in range(n):
+            found[i, :, i] = self.diagonal[i]
+        for i in range(n - 1):
+            found[i, :, i + 1], found[i + 1, :, i] = self.upper[i], self.upper[i].T
+        return found.reshape(n * b, n * b)
+
+    def damped(self, share: float) -> BlockTridiagonal:
+        """Return the matrix with its diagonal larger by a share of itself (Marquardt 1963)."""
+        diagonal = self.diagonal.copy()
+        k = np.arange(diagonal.shape[1])
+        diagonal[:, k, k] *= 1.0 + share
+        return BlockTridiagonal(diagonal, self.upper)
+
+    def solve(self, right: Array) -> Array:
+        """Return x of A x = right, both of shape (n, b), by block elimination (Thomas), in O(n b^3).
+
+        Raises:
+            numpy.linalg.LinAlgError: A block of the elimination is singular.
+        """
+        n, b, _ = self.diagonal.shape
+        gains, found = np.empty((max(n - 1, 0), b, b)), np.empty((n, b))
+        block, rest = self.diagonal[0], right[0]
+        for i in range(n - 1):
+            solved = np.linalg.solve(block, np.concatenate([self.upper[i], rest[:, None]], axis=1))
+            gains[i], found[i] = solved[:, :b], solved[:, b]
+            block = self.diagonal[i + 1] - self.upper[i].T @ gains[i]
+            rest = right[i + 1] - self.upper[i].T @ found[i]
+        found[-1] = np.linalg.solve(block, rest)
+        for i in range(n - 2, -1, -1):
+            found[i] -= gains[i] @ found[i + 1]
+        return found

@@ -22,8 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.baselines.gpmp.block_tridiagonal import BlockTridiagonal
-from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
+from apex_ompl.baselines.gpmp.gaussian_process import BlockTridiagonal, GaussianProcess
 from apex_ompl.kernel.clearance_costs import ClearanceCosts
 from apex_ompl.types import Array
 
@@ -65,7 +64,7 @@ class Optimum(NamedTuple):
     Attributes:
         supports: Positions and velocities, shape (N + 1, 2, dof).
         evaluation: Their cost.
-        first_cost: Cost of where it began.
+        first_cost: Cost of where it started.
         iterations: Number of steps taken.
         evaluations: Number of motions whose cost was computed.
         converged: Whether the cost fell by less than the tolerance in the end.
@@ -166,7 +165,7 @@ class FactorGraph(Factors):
     def _matrix(self, gram: Array) -> BlockTridiagonal:
         """Return the Gauss-Newton matrix of all factors from that of the checked states, shape (K, dof, dof)."""
         count, dof = self.process.intervals, gram.shape[1]
-        before, behind = self.weights[:, 0, 0], self.weights[:, 0, 1]
+        before, after = self.weights[:, 0, 0], self.weights[:, 0, 1]
         flat = gram.reshape(count, self.checked, dof * dof)
 
         def blocks(first: Array, second: Array, chosen: Array) -> Array:
@@ -176,8 +175,8 @@ class FactorGraph(Factors):
 
         prior, eye = self.process.inner_precision, np.eye(dof)
         diagonal = np.kron(prior.diagonal[0], eye) + blocks(before, before, flat[1:])
-        diagonal += blocks(behind, behind, flat[:-1])
-        upper = blocks(before, behind, flat[1:-1])
+        diagonal += blocks(after, after, flat[:-1])
+        upper = blocks(before, after, flat[1:-1])
         if len(upper):
             upper += np.kron(prior.upper[0], eye)
         return BlockTridiagonal(diagonal, upper)
@@ -188,11 +187,11 @@ class FactorGraph(Factors):
     ) -> Optimum:  # fmt: skip
         """Return the maximum of the posterior that Levenberg-Marquardt steps find.
 
-        The damping, a share of the diagonal, falls to a tenth behind a step that lowers the cost, and grows tenfold
-        behind one that does not.
+        The damping, a share of the diagonal, falls to a tenth after a step that lowers the cost, and grows tenfold
+        after one that does not.
 
         Args:
-            supports: Where to begin, shape (N + 1, 2, dof).
+            supports: Where to start, shape (N + 1, 2, dof).
             iterations: Most motions that are tried.
             tolerance: A step that lowers the cost by less than this share is the last.
             damping: Damping of the first step.
@@ -243,7 +242,7 @@ class CostFunctional(Factors):
         """Return supports whose positions are brought within the limits, smoothly: CHOMP's projection (2009).
 
         Where a joint exceeds a limit it is moved by the column of K of its worst support, until none exceeds any; what
-        is left behind some rounds is cut off.
+        is left after some rounds is clipped.
         """
         covariance, found = self.process.inner_covariance, supports.copy()
         inner = found[1:-1].reshape(-1, found.shape[2])  # a view
@@ -265,11 +264,11 @@ class CostFunctional(Factors):
         """Return what steps along the functional gradient come to.
 
         Args:
-            supports: Where to begin, shape (N + 1, 2, dof).
+            supports: Where to start, shape (N + 1, 2, dof).
             iterations: Most motions that are tried.
             tolerance: A step that lowers the cost by less than this share is the last.
             rate: Length 1 / eta of a step, as a multiple of the functional gradient; halved while the cost grows, and
-                doubled behind a step up to this.
+                doubled after a step up to this.
             largest: Largest change of a position in a step [rad].
             accepts: Asked about each motion whether it is good enough already.
             stop: Asked before each step whether to end.

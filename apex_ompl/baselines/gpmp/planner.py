@@ -152,7 +152,7 @@ class GPMP2(GaussianProcessParameters):
     """Maximum a posteriori on a Gaussian-process prior, a factor graph (Dong, Mukadam, Dellaert and Boots, RSS 2016).
 
     The longer account is Mukadam, Dong, Yan, Dellaert and Boots, "Continuous-time Gaussian process motion planning via
-    probabilistic inference", IJRR 2018. Levenberg-Marquardt steps, whose normal equations are block-tridiagonal, begin
+    probabilistic inference", IJRR 2018. Levenberg-Marquardt steps, whose normal equations are block-tridiagonal, start
     at the straight line at constant velocity, and go on until they converge; what comes out is a solution if the whole
     path is proved free.
 
@@ -183,7 +183,7 @@ class GPMP2(GaussianProcessParameters):
 class GaussianProcessPlanner(OwnPlanner):
     """OMPL planner GPMP or GPMP2: one initial motion after the other is optimized, until one is proved free.
 
-    A local method: it ends without a solution when it has nothing left to begin from, and says what is in the way.
+    A local method: it ends without a solution when it has nothing left to start from, and says what is in the way.
 
     Attributes:
         parameters: Its parameters.
@@ -210,7 +210,7 @@ class GaussianProcessPlanner(OwnPlanner):
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.validator, self.optima = self.validator.current(), []
         validator, checker = self.validator, self.validator.checker
-        begin, report, inputs = time.perf_counter(), self.report, self.getPlannerInputStates()
+        started, report, inputs = time.perf_counter(), self.report, self.getPlannerInputStates()
         lower, upper = bounds_of(self.getSpaceInformation(), checker.robot)
         starts = read_starts(inputs, len(lower))
         goals = read_goals(inputs, len(lower), ptc, self.getProblemDefinition().getGoal())
@@ -234,7 +234,7 @@ class GaussianProcessPlanner(OwnPlanner):
                 valid = proved and validator.accepts(path.states, lambda: bool(ptc()))
             if valid:
                 report.solved_by, report.first_verified, report.reason = self.parameters.name, True, ""
-                report.add_solution(self, path, time.perf_counter() - begin)
+                report.add_solution(self, path, time.perf_counter() - started)
                 return Status.EXACT_SOLUTION
             report.reason = report.reason or (
                 NOT_ACCEPTED if proof is None or proved else self._fault(path, proof, optimum)

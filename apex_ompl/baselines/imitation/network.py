@@ -85,7 +85,7 @@ class PolicyNetwork(nn.Module):
         """Return the next states, shape (B, W, chunk, dof) [rad].
 
         Args:
-            conditions: Goals and obstacles of B paths; starts are not looked at.
+            conditions: Goals and obstacles of B paths; starts are not used.
             state: Present states, W of each path, shape (B, W, dof) [rad].
             time: How many steps of the clock they are after the start of the path, shape (B, W), integers.
         """

@@ -63,7 +63,7 @@ class ImitationPlanner(OwnPlanner):
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.validator = self.validator.current()
-        report, begin, dof = self.report, time.perf_counter(), self.validator.checker.robot.dof
+        report, started, dof = self.report, time.perf_counter(), self.validator.checker.robot.dof
         inputs = self.getPlannerInputStates()
         starts = read_starts(inputs, dof)
         if not starts:
@@ -83,7 +83,7 @@ class ImitationPlanner(OwnPlanner):
                 continue
             path, report.solved_by = found
             report.first_verified = True
-            report.add_solution(self, path, time.perf_counter() - begin)
+            report.add_solution(self, path, time.perf_counter() - started)
             return Status.EXACT_SOLUTION
         report.reason = "; ".join(dict.fromkeys(reasons))
         if not ptc():
@@ -117,7 +117,7 @@ class ImitationPlanner(OwnPlanner):
         return found or ("" if self.validator.accepts(states, stop) else NOT_ACCEPTED)
 
     def _rolled(self, start: Array, goal: Array, stop: Callable[[], bool]) -> Array | None:
-        """Return the path of the policy, shape (N, dof), or None where it was told to stop."""
+        """Return the path of the policy, shape (N, dof), or None where it was stopped."""
         checker, parameters = self.validator.checker, self.parameters
         query = make_query(checker, start, goal, point=self.policy.sees_point)
         kernel = checker.kernel.within(*bounds_of(self.getSpaceInformation(), checker.robot))

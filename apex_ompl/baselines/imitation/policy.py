@@ -58,7 +58,7 @@ class ImitationPolicy:
 
     def roll_out(
         self, queries: Sequence[Query], kernel: Kernel, *, executed: int | None = None, blend: bool = True,
-        begin: int = 0, steps: int | None = None, stop: Callable[[], bool] = lambda: False,
+        first_step: int = 0, steps: int | None = None, stop: Callable[[], bool] = lambda: False,
     ) -> Array | None:  # fmt: skip
         """Return the paths of the policy from the starts of Q queries on, shape (Q, states, dof) [rad].
 
@@ -72,22 +72,22 @@ class ImitationPolicy:
             executed: Number of states of a chunk that are followed, at most all; 8 by default.
             blend: Whether the states that follow are averages of the new chunk and of the rest of the one before,
                 weighted from the latter to the former (temporal ensembling).
-            begin: Step of the clock at which the starts are.
+            first_step: Step of the clock at which the starts are.
             steps: Number of steps; by default until the end of the clock.
             stop: Asked before each chunk whether to give up.
 
         Returns:
-            The paths, whose first states are the starts bit for bit; None where it was told to stop.
+            The paths, whose first states are the starts bit for bit; None where it was stopped.
         """
         executed = self.executed if executed is None else executed
-        last = self.clock - 1 if steps is None else min(begin + steps, self.clock - 1)
+        last = self.clock - 1 if steps is None else min(first_step + steps, self.clock - 1)
         start = np.stack([query.start for query in queries])
         limits = kernel.robot.arrays
         lower, upper = (torch.tensor(v, dtype=torch.float32) for v in (limits.lower, limits.upper))
         with one_torch_thread(), torch.inference_mode():
             conditions = batch_queries(queries, NO_PROBES, kernel)
             now, before = conditions.start, None
-            states, at = [now[:, None]], begin
+            states, at = [now[:, None]], first_step
             while at < last:
                 if stop():
                     return None

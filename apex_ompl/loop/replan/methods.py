@@ -1,139 +1,113 @@
-"""Ways of replanning by name."""
+"""Replanners by name: our own are registered here, those of the baselines in their own modules."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from importlib import import_module
 
-from apex_ompl.baselines.control.mppi import PathIntegral
-from apex_ompl.baselines.control.potential_field import PotentialField
-from apex_ompl.baselines.damon.replanner import ManifoldGraph
-from apex_ompl.baselines.drrt.replanner import KeptTree
-from apex_ompl.baselines.gpmp.replanner import IncrementalGPMP, IncrementalGPMP2
-from apex_ompl.baselines.imitation.replanner import Imitation
-from apex_ompl.loop.replan.paper import OneProposal
+from apex_ompl.errors import ParameterError
+from apex_ompl.loop.replan.one_plan import OneProposal, RRTConnectFromRest, StopAndWait
 from apex_ompl.loop.replan.portfolio import Portfolio
-from apex_ompl.loop.replan.proposals import Proposals, Renoised
-from apex_ompl.loop.replan.resuming import Resume
-from apex_ompl.loop.replan.snapshot import Snapshot
-from apex_ompl.loop.replan.sprint import Sprint
-from apex_ompl.moving.request import Replanner
-from apex_ompl.moving.settings import LoopSettings
-from apex_ompl.moving.sources import Faster, Lines, Route
+from apex_ompl.loop.replan.sources import Faster, Lines, Proposals, Renoised, Route, Sprint
+from apex_ompl.moving.replanner import FROM_REST, ONE_PLAN, REGISTRY, UNGUARDED, Method, Replanner, register
+from apex_ompl.moving.search import Source
 from apex_ompl.util.validation import check_name
 
-
-@dataclass(frozen=True)
-class Method:
-    """A way of replanning.
-
-    Attributes:
-        make: Makes its replanner, new for each run.
-        settings: What it changes of the parameters of the loop.
-        about: One line about it.
-    """
-
-    make: Callable[[], Replanner]
-    settings: dict[str, Any]
-    about: str
-
-
-ONE_PLAN = {"hastens": False}
-FROM_REST = {"from_rest": True, **ONE_PLAN}
-BLIND = {"prediction": "still", "guarded": False, **ONE_PLAN}
-PAPER = {**BLIND, "verified": False, "from_rest": True, "by_distance": True}
-
-
-def _no_network(*, waits: bool = True) -> Portfolio:
-    return Portfolio([Faster(), Route(), Lines(), Lines(bumps=3)], waits=waits)
-
-
-def _all_parts() -> Portfolio:
-    return Portfolio([Faster(), Route(), Lines(), Proposals(), Lines(bumps=3)])
-
-
-METHODS = {
-    "apex": Method(_all_parts, {}, "all parts, the network among them"),
-    "apex-unguarded": Method(
-        _all_parts, {"guarded": False}, "all parts, without a proved stop in hand: what the guarantee costs"
-    ),
-    "apex-foreseeing": Method(
-        _all_parts, {"guarded": False, "prediction": "truth"},
-        "the same, told where obstacles are and how they move: what better eyes could gain",
-    ),
-    "no-network": Method(_no_network, {}, "all parts but the network's proposals"),
-    "apex-renoise": Method(
-        lambda: Portfolio([Faster(), Route(), Lines(), Renoised(), Proposals(), Lines(bumps=3)]), {},
-        "all parts, and what is left of the motion noised and denoised again",
-    ),
-    "apex-sprint": Method(
-        lambda: Portfolio([Faster(), Route(), Lines(), Sprint(), Proposals(), Lines(bumps=3)]), {},
-        "all parts, and a sprint of trees where the robot stands",
-    ),
-    "apex-paper": Method(
-        lambda: OneProposal(guided=True), PAPER,
-        "the paper's loop: stop near an obstacle, one guided proposal from rest, followed unproved",
-    ),
-    "apex-paper-unguided": Method(lambda: OneProposal(guided=False), PAPER, "the same without guidance"),
-    "retime": Method(
-        lambda: Resume(_no_network(waits=False), retimes=True), ONE_PLAN,
-        "one plan, along which the speed alone is chosen anew",
-    ),
-    "stop-and-wait": Method(
-        lambda: Resume(_no_network(waits=False)), FROM_REST,
-        "one plan; stops where it is blocked, goes on when it is clear",
-    ),
-    "rrtconnect": Method(
-        Snapshot, FROM_REST, "stops where the way is blocked; RRTConnect from rest, among obstacles where they are seen"
-    ),
-    "blind": Method(
-        lambda: Portfolio([Route(), Lines(), Proposals(), Lines(bumps=3)], evades=False, waits=False),
-        {**BLIND, "monitored": False},
-        "a plan among obstacles where they were seen at first, followed blindly",
-    ),
-    "gpmp2": Method(IncrementalGPMP2, ONE_PLAN, "GPMP2 from the moving robot, warm from the last motion (as iGPMP2)"),
-    "gpmp": Method(IncrementalGPMP, ONE_PLAN, "GPMP from the moving robot: steps along the functional gradient"),
-    "mppi": Method(PathIntegral, ONE_PLAN, "model predictive path integral control"),
-    "potential-field": Method(PotentialField, ONE_PLAN, "a reflex down an artificial potential"),
-    "drrt": Method(
-        KeptTree, FROM_REST, "dynamic RRT: stops where the way is blocked; a tree from the goal, kept and repaired"
-    ),
-    "damon": Method(
-        ManifoldGraph, FROM_REST, "DAMON: stops where the way is blocked; A* over a graph on a learned manifold"
-    ),
-    "il": Method(
-        Imitation, {**BLIND, "verified": False}, "an imitation policy as a reflex, followed unproved"
-    ),
-    "il-paper": Method(
-        lambda: Imitation("il-paper"), {**BLIND, "verified": False}, "the same, which sees one obstacle point"
-    ),
-}  # fmt: skip
+PAPER = {**UNGUARDED, "verified": False, "from_rest": True, "by_distance": True}
+BASELINES = (
+    "gpmp.replanner", "control.mppi", "control.potential_field", "drrt.replanner", "damon.replanner",
+    "imitation.replanner",
+)  # fmt: skip
+"""Modules of :mod:`apex_ompl.baselines` that register replanners."""
 
 
 def names() -> tuple[str, ...]:
-    """Names of the ways of replanning."""
-    return tuple(METHODS)
+    """Names of the replanners."""
+    _load_baselines()
+    return tuple(REGISTRY)
 
 
-def method(name: str) -> Method:
-    """Return a way of replanning by its name.
-
-    Raises:
-        UnknownNameError: There is none of that name.
-    """
-    return METHODS[check_name(name, "way of replanning", METHODS)]
-
-
-def adapted(settings: LoopSettings, one: Method) -> LoopSettings:
-    """Return the parameters of the loop with what a way of replanning changes of them."""
-    return replace(settings, **one.settings)
-
-
-def replanner_of(name: str) -> Replanner:
-    """Return a new replanner of a way of replanning by its name.
+def named(name: str) -> Method:
+    """Return a replanner by its name.
 
     Raises:
         UnknownNameError: There is none of that name.
     """
-    return method(name).make()
+    if name not in REGISTRY:
+        _load_baselines()
+    return REGISTRY[check_name(name, "replanner", REGISTRY)]
+
+
+def method_of(method: str | Replanner) -> Method:
+    """Return a replanner of that name, or a given one as a method of its class's name.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        ParameterError: It is neither a name nor a replanner.
+    """
+    if isinstance(method, str):
+        return named(method)
+    if not all(callable(getattr(method, name, None)) for name in ("prepare", "replan")):
+        raise ParameterError("method", method, "the name of a replanner, or an object with prepare and replan")
+    return Method(type(method).__name__, lambda: method)
+
+
+def replanner_of(method: str | Replanner) -> Replanner:
+    """Return a new replanner of that name, or the given one.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        ParameterError: It is neither a name nor a replanner.
+    """
+    return method_of(method).make()
+
+
+def _load_baselines() -> None:
+    for module in BASELINES:
+        import_module(f"apex_ompl.baselines.{module}")
+
+
+def _portfolio(*others: Source) -> Portfolio:
+    """Return all sources, with others before the network's proposals."""
+    return Portfolio([Faster(), Route(), Lines(), *others, Proposals(), Lines(perturbed=3)])
+
+
+def _no_network(*, waits: bool = True) -> Portfolio:
+    return Portfolio([Faster(), Route(), Lines(), Lines(perturbed=3)], waits=waits)
+
+
+register("apex", _portfolio, "all parts, the network among them")
+register(
+    "apex-unguarded", _portfolio, "all parts, without a fail-safe stop: the cost of the guarantee", {"guarded": False}
+)
+register(
+    "apex-foreseeing", _portfolio, "the same with the true motions of obstacles: the gain of a better sensor",
+    {"guarded": False, "prediction": "truth"},
+)  # fmt: skip
+register("no-network", _no_network, "all parts but the network's proposals")
+register(
+    "apex-renoise", lambda: _portfolio(Renoised()), "all parts, and the remaining motion noised and denoised again"
+)
+register("apex-sprint", lambda: _portfolio(Sprint()), "all parts, and a sprint of trees where the robot is at rest")
+register(
+    "apex-paper", partial(OneProposal, guided=True),
+    "the paper's loop: stop near an obstacle, one guided proposal from rest, followed unproved", PAPER,
+)  # fmt: skip
+register("apex-paper-unguided", partial(OneProposal, guided=False), "the same without guidance", PAPER)
+register(
+    "retime", lambda: StopAndWait(_no_network(waits=False), retimes=True),
+    "one plan; only the speed along its path is replanned", ONE_PLAN,
+)  # fmt: skip
+register(
+    "stop-and-wait", lambda: StopAndWait(_no_network(waits=False)),
+    "one plan; stops where it is blocked, continues when the rest is clear", FROM_REST,
+)  # fmt: skip
+register(
+    "rrtconnect", RRTConnectFromRest,
+    "stops where the way is blocked; RRTConnect from rest, among obstacles where they are seen", FROM_REST,
+)  # fmt: skip
+register(
+    "blind",
+    lambda: Portfolio([Route(), Lines(), Proposals(), Lines(perturbed=3)], evades=False, waits=False),
+    "a plan among obstacles where they were seen at first, followed to the end", {**UNGUARDED, "monitored": False},
+)  # fmt: skip

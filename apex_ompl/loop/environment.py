@@ -1,0 +1,70 @@
+"""What the closed loop runs in: the environment with its moving obstacles, and what a sensor observes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.timing import Trajectory
+from apex_ompl.types import Array
+from apex_ompl.util.display import fields_line
+
+
+class Environment(Protocol):
+    """What the robot and the obstacles truly do in a run.
+
+    The clock of a run calls ``advance`` at each of its steps, with times that increase from 0 and the state that the
+    robot's driver reached, and ``start`` once, when the first motion is committed. ``present`` may be asked about any
+    time up to the last step; sensors observe what it returns.
+
+    Attributes:
+        name: Its name, such as ``popup/vertical/large/12``.
+        problem: Static obstacles, start and goal, and held objects.
+        fastest: Largest speed of its obstacles [m/s].
+        ran: Whether a run was made in it; each is good for one.
+    """
+
+    name: str
+    problem: Problem
+    fastest: float
+    ran: bool
+
+    def start(self, motion: Trajectory, time: float) -> None:
+        """Take the first motion that the robot is to follow, and when it starts [s]."""
+
+    def advance(self, time: float, q: Array) -> None:
+        """Take the robot's state, shape (dof,), at a time [s]."""
+
+    def present(self, time: float) -> tuple[Obstacle, ...]:
+        """Return the moving obstacles that exist at a time [s], where they are then, with their velocities."""
+
+    def script(self) -> tuple[Obstacle, ...]:
+        """Return what the moving obstacles did up to the last step: obstacles with ``trajectory`` and ``appears``."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Moving obstacles that a sensor saw at one moment.
+
+    Attributes:
+        stamp: When they were where they were seen [s].
+        received: When the loop receives the observation [s], not before the stamp.
+        seen: The obstacles with their shapes where they were seen, by name, without velocities. A known obstacle that
+            is missing here was not seen, which tells nothing about where it is.
+    """
+
+    stamp: float
+    received: float
+    seen: tuple[Obstacle, ...]
+
+    __repr__ = fields_line
+
+
+class ObservationSource(Protocol):
+    """A sensor at work."""
+
+    def observations(self, until: float) -> Iterable[Observation]:
+        """Return the observations with stamps up to a time [s] that were not returned before, in order of stamp."""
