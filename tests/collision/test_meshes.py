@@ -183,6 +183,6 @@ def test_convex_meshes_are_known_without_comparing_all_triangles_with_all_faces(
     compared = list[int]()
     monkeypatch.setattr(exact_shapes, "hull_planes", lambda h: (compared.append(1), (normals, offsets))[1])
     found = exact_shapes._analyzed(geometry)
-    assert (len(found.leaf) == 0) == convex and len(compared) <= 2
+    assert (len(found.tree.leaf) == 0) == convex and len(compared) <= 2
     if shape == "dented":
         assert found.depth == pytest.approx(depths.max(), abs=1e-15)

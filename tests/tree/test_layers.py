@@ -3,7 +3,7 @@
 From the top, as CONTRIBUTING has it:
 
 1. `cli` parses commands; `evaluation` runs OMPL's Benchmark and reports; `viz` draws: renderings, plots, the viewer.
-2. `api`: `load_problem`, `setup`, `plan`; `loop`: the closed loop, its sensor, executor and clocks; `loop.replan`:
+2. `api`: `load_problem`, `setup`, `plan`, `run`; `loop`: environment, sensor, executor and clocks; `loop.replan`:
    replanners.
 3. `planning`: `MotionPlanner`, `World`, the steps of a plan; `result`: what a plan returns.
 4. `planners/`, `problems/` (at the top of the tree): planners by name with their parameters; suites, worlds, frozen
@@ -18,8 +18,6 @@ From the top, as CONTRIBUTING has it:
 9. `collision`: the checker, spheres before meshes; `paths`: splines, the optimizer; `robot`: Pinocchio models, MoveIt's
    files.
 10. `kernel`: wrappers of compiled code over flat arrays; `scene`: problem files and bodies; `util`, `types`, `errors`.
-    `planners/` and `problems/` stand at the top because that is where users of OMPL look for them; `apex_ompl/planners`
-    and `apex_ompl/problems` are links to them, so that both import as parts of the package.
 """
 
 from __future__ import annotations
@@ -133,5 +131,5 @@ def test_nobody_outside_the_kernel_imports_compiled_code() -> None:
 
 def test_contributing_has_the_same_ten_lines() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text().partition("## The house in ten lines")[2].partition("\n## ")[0]
-    mine, theirs = (re.findall(r"^(\d+\. .*?)(?=^\d+\. |\Z)", some, re.M | re.S) for some in (__doc__ or "", text))
+    mine, theirs = (re.findall(r"^(\d+\. .*?)(?=^\d+\. |\n\n|\Z)", some, re.M | re.S) for some in (__doc__ or "", text))
     assert [one.split() for one in mine] == [one.split() for one in theirs] and len(mine) == 10
