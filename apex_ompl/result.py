@@ -292,7 +292,7 @@ def _summary(result: PlanResult) -> Summary:
         uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
         rows += [("motion", motion), ("limits", f"{uses} used")]
     if result.dynamic_obstacles:
-        rows.append(("dynamic obstacles", f"proved apart from {', '.join(result.dynamic_obstacles)} in time"))
+        rows.append(("obstacles", f"proved apart from {', '.join(result.dynamic_obstacles)} in time"))
     rows.append(("checks", f"{result.checks} states checked, planner {result.planner}, seed {result.seed}"))
     rows += [("note", note) for note in result.notes]
     by = f" by {result.solved_by}" if result.solved_by else ""

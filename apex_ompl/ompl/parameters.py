@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.util.validation import LARGEST_INT, check_name
@@ -75,14 +75,16 @@ def one_of(default: str, *others: str) -> Any:
     return dataclasses.field(default=default, metadata={"words": (default, *others)})
 
 
+ParametersT = TypeVar("ParametersT", bound=Parameters)
+
 REGISTRY: dict[str, type[Parameters]] = {}
 """Parameters by name of planner, of those whose modules were imported; see :mod:`apex_ompl.planners`."""
 
 
-def register(name: str) -> Callable[[type[Parameters]], type[Parameters]]:
+def register(name: str) -> Callable[[type[ParametersT]], type[ParametersT]]:
     """Register a parameter class under a planner name."""
 
-    def enter(cls: type[Parameters]) -> type[Parameters]:
+    def enter(cls: type[ParametersT]) -> type[ParametersT]:
         REGISTRY[name] = cls
         cls.name = name
         return cls

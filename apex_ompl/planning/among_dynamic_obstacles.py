@@ -318,14 +318,14 @@ def _guesses(query: PlanQuery, limits: Limits, motion: Trajectory, turn: int) ->
         for control in optimizer.starts(query.setup.start, goal, PERTURBATIONS, rng, size):
             control[:, held] = query.setup.start[held]
             states = optimizer.spline.path(control)
-            yield Guess(states, _least_duration(states, limits))
+            yield Guess(states, _evenly_paced_duration(states, limits))
             if turn > 0:  # aside, back, and then along the line
                 aside = states - optimizer.spline.path(optimizer.spline.line(states[0], goal))
                 line = np.linspace(states[0], goal, len(states))
-                yield Guess(np.concatenate([states[0] + aside, line]), _least_duration(line, limits))
+                yield Guess(np.concatenate([states[0] + aside, line]), _evenly_paced_duration(line, limits))
 
 
-def _least_duration(states: Array, limits: Limits) -> float:
+def _evenly_paced_duration(states: Array, limits: Limits) -> float:
     """Return about how long a path takes at an even pace of its parameter [s]."""
     speed = np.abs(np.diff(states, axis=0)) * (len(states) - 1)
     distance = np.abs(states[-1] - states[0]) / limits.acceleration

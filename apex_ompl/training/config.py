@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
@@ -20,9 +20,26 @@ from apex_ompl.model.config import (
 )
 from apex_ompl.util.schema import StrictModel, read_yaml, replaced, validate
 
-SCHEMA = "apex-ompl/training/1"
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
+
+
+class TrainingFile(StrictModel):
+    """Configuration of a training as a YAML file, whose ``schema`` a subclass names by a field ``schema_``."""
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> Self:
+        """Read a configuration, with some keys replaced: ``changes`` maps dotted keys to values.
+
+        Raises:
+            MissingFileError: The file cannot be read.
+            FileFormatError: It does not follow the schema.
+        """
+        data = read_yaml(Path(path), "training configuration")
+        (schema,) = get_args(cls.model_fields["schema_"].annotation)
+        if data.get("schema") != schema:
+            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {schema!r}")
+        return validate(cls, replaced(data, changes or {}, str(path)), str(path))
 
 
 class MirrorConfig(StrictModel):
@@ -54,7 +71,7 @@ class AutoencoderTraining(StrictModel):
     divergence: Annotated[float, Field(ge=0.0)] = 1e-5
 
 
-class TrainingConfig(StrictModel):
+class TrainingConfig(TrainingFile):
     """Configuration of ``scripts/train.py``; attributes are keys of the file, except ``validation_sampling``.
 
     Attributes:
@@ -158,16 +175,3 @@ class TrainingConfig(StrictModel):
                 "validation_sampling", "sampling",
             }
         )  # fmt: skip
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> TrainingConfig:
-        """Read a configuration, with some keys replaced: ``changes`` maps dotted keys to values.
-
-        Raises:
-            MissingFileError: The file cannot be read.
-            FileFormatError: It does not follow the schema.
-        """
-        data = read_yaml(Path(path), "training configuration")
-        if data.get("schema") != SCHEMA:
-            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        return validate(cls, replaced(data, changes or {}, str(path)), str(path))

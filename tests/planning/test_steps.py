@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,19 @@ class Returns:
     def run(self, context: Any) -> Any:
         self.calls += 1
         return self.what(context) if callable(self.what) else self.what
+
+
+def test_a_plan_reaches_a_stage_in_ten_calls() -> None:
+    seen: list[str] = []
+
+    class Watching:
+        def run(self, context: Any) -> None:
+            frames = traceback.walk_stack(None)
+            own = [str(frame.f_globals["__name__"]) for frame, _ in frames]
+            seen.extend(name for name in own if name.startswith("apex_ompl."))
+
+    plan(PROBLEM, lambda si: APEX(si, stages=[Watching(), *ApexParameters().stages()]), timeout=20.0)
+    assert 0 < len(seen) <= 10 and seen[-1] == "apex_ompl.api", seen
 
 
 def test_paths_of_a_users_stage_are_checked() -> None:

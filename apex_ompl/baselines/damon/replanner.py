@@ -49,9 +49,8 @@ class DamonReplanner:
         """
         values = DAMONParameters()
         robot = context.setup.robot
-        manifold = shared_manifold(str(getattr(values, "model")), robot.name)  # noqa: B009 - of a subclass
-        kind, connections = getattr(values, "nodes"), getattr(values, "connections")  # noqa: B009
-        self.damon = Damon.of(manifold, robot.joint_names, kind, connections)
+        manifold = shared_manifold(values.model, robot.name)
+        self.damon = Damon.of(manifold, robot.joint_names, values.nodes, values.connections)
         self._usable.clear()
         self._clear_of_static.clear()
         self._blocked.clear()

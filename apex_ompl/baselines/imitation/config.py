@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from apex_ompl.errors import FileFormatError
 from apex_ompl.model.config import Count, Size
-from apex_ompl.training.config import MirrorConfig, Positive, Share
-from apex_ompl.util.schema import StrictModel, read_yaml, replaced, validate
-
-SCHEMA = "apex-ompl/imitation-training/1"
+from apex_ompl.training.config import MirrorConfig, Positive, Share, TrainingFile
+from apex_ompl.util.schema import StrictModel
 
 
 class NetworkConfig(StrictModel):
@@ -54,7 +48,7 @@ class NetworkConfig(StrictModel):
         return sum(map(len, self.groups))
 
 
-class ImitationConfig(StrictModel):
+class ImitationConfig(TrainingFile):
     """Configuration of ``scripts/train_il.py``; attributes are keys of the file.
 
     Attributes:
@@ -114,16 +108,3 @@ class ImitationConfig(StrictModel):
     def determining(self) -> str:
         """Settings that determine the trained weights, as JSON: all but paths, the end, logging and saving."""
         return self.model_dump_json(exclude={"data", "robot", "init", "steps", "cooldown", "log_every", "save_every"})
-
-    @classmethod
-    def read(cls, path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> ImitationConfig:
-        """Read a configuration, with some keys replaced: ``changes`` maps dotted keys to values.
-
-        Raises:
-            MissingFileError: The file cannot be read.
-            FileFormatError: It does not follow the schema.
-        """
-        data = read_yaml(Path(path), "training configuration")
-        if data.get("schema") != SCHEMA:
-            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-        return validate(cls, replaced(data, changes or {}, str(path)), str(path))
