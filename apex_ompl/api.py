@@ -77,9 +77,11 @@ def plan(
     params: Mapping[str, Any] | None = None,
     snapshot: bool = False,
     timing: bool | Timing = True,
+    objective: str = "time",
+    calm_factor: float = 1.1,
     leave_contact: float = 0.0,
 ) -> PlanResult:
-    """Plan a path, prove it by the full check, and time it.
+    """Plan a path, prove it by the full check, and optimize its motion.
 
     The straight line to each goal is tried before the planner runs. What the planner finds is shortened unless it is
     smooth, proved, and planned anew where the proof fails. A path that was found and not proved, or not timed, in time
@@ -100,6 +102,9 @@ def plan(
         snapshot: Take dynamic obstacles to stand where they are at time 0. Otherwise the motion is planned and proved
             in time (:mod:`apex_ompl.planning.among_dynamic_obstacles`).
         timing: How the path is timed, or whether; the timed motion is proved too.
+        objective: What the motion is to be: ``time``, as fast as the limits allow; ``length``, along the shortest path
+            found; ``calm``, the least integral of the squared jerk in ``calm_factor`` times the fastest motion's time.
+        calm_factor: See ``objective``, 1 to 100.
         leave_contact: Depth of contacts at the start that the path may leave along growing clearance, up to 0.001 [m];
             a note says so, since that way out is not proved.
 
@@ -117,7 +122,7 @@ def plan(
     with kept_planner(loaded.robot) as kept:
         return kept.plan_problem(
             loaded, planner, timeout=timeout, seed=seed, simplify=simplify, params=params, snapshot=snapshot,
-            timing=timing, leave_contact=leave_contact,
+            timing=timing, objective=objective, calm_factor=calm_factor, leave_contact=leave_contact,
         )  # fmt: skip
 
 

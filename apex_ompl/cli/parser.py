@@ -145,6 +145,14 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "--leave-contact", type=float, default=0.0, metavar="METRES",
         help="depth of contacts at the start that the path may leave, up to 0.001 (default: 0)",
     )  # fmt: skip
+    parser.add_argument(
+        "--objective", default="time", metavar="NAME",
+        help="what the motion is to be: time, length or calm (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--calm-factor", type=float, default=1.1, metavar="FACTOR",
+        help="duration of a calm motion as a multiple of the fastest one's (default: %(default)s)",
+    )  # fmt: skip
     parser.add_argument("--no-timing", action="store_true", help="leave the path without times")
     parser.add_argument(
         "--timing-method", default="ruckig", metavar="NAME",

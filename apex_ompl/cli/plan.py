@@ -54,6 +54,8 @@ def run(parsed: argparse.Namespace) -> int:
         params=params,
         snapshot=parsed.snapshot,
         timing=timing if not parsed.no_timing else False,
+        objective=parsed.objective,
+        calm_factor=parsed.calm_factor,
         leave_contact=parsed.leave_contact,
     )
     if parsed.out is not None:

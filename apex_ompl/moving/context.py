@@ -15,11 +15,11 @@ from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.moving.stopping import stop, stop_along, stops_proved
-from apex_ompl.moving.timed_spline import Start
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.checks import SAME_STATE
+from apex_ompl.timing.timed_spline import Start
 from apex_ompl.timing.trajectory import concatenate
 from apex_ompl.types import Array
 

@@ -14,13 +14,14 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import clearance_in_time
+from apex_ompl.moving.motion_optimizer import MotionOptimizer, MotionPool, MotionSettings
 from apex_ompl.moving.replanner import Request
-from apex_ompl.moving.timed_spline import MotionOptimizer, MotionPool, MotionSettings, Start
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing, vector
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.ruckig_method import between
+from apex_ompl.timing.timed_spline import Start
 from apex_ompl.types import Array
 
 MOTIONS = MotionSettings(samples=2)

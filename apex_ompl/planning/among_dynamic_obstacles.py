@@ -2,7 +2,7 @@
 
 1. A path among the static obstacles is found and timed. Where its motion meets no dynamic obstacle, it is the plan.
 2. Otherwise the motion along the path is retimed: it waits, slows down or speeds up (:mod:`apex_ompl.moving.retime`).
-3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.timed_spline`).
+3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.motion_optimizer`).
 4. Where all that fails, paths are planned around the volumes that the dynamic obstacles sweep.
 
 The motion that arrives first is taken.
@@ -21,9 +21,9 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel import Kernel
+from apex_ompl.moving.motion_optimizer import MotionOptimizer
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.timed_proof import TimedProver
-from apex_ompl.moving.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
@@ -34,6 +34,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.timed_spline import Start, TimedSpline
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
 

@@ -46,6 +46,8 @@ class PlanOptions:
     params: Mapping[str, Any] | None = None
     snapshot: bool = False
     timing: bool | Timing = True
+    objective: str = "time"
+    calm_factor: float = 1.1
     group: Group | None = None
     leave_contact: float = 0.0
 
@@ -57,7 +59,9 @@ class PlanOptions:
         """
         from apex_ompl.planning.departure import LARGEST_DEPTH
         from apex_ompl.timing import Timing
+        from apex_ompl.timing.duration import check_objective
 
+        check_objective(self.objective, self.calm_factor)
         check_arguments(self.timeout, self.seed)
         check_number(self.leave_contact, "leave_contact", 0.0, LARGEST_DEPTH)
         check_flag(self.simplify, "simplify")
@@ -78,6 +82,8 @@ class PlanKeywords(TypedDict, total=False):
     params: Mapping[str, Any] | None
     snapshot: bool
     timing: bool | Timing
+    objective: str
+    calm_factor: float
     leave_contact: float
 
 
@@ -202,7 +208,7 @@ class MotionPlanner:
                 by joint names may leave them out. All by default.
             name: Name of the problem in the result.
             **options: As of :func:`apex_ompl.plan`: ``timeout``, ``seed``, ``simplify``, ``params``, ``snapshot``,
-                ``timing``, ``leave_contact``.
+                ``timing``, ``objective``, ``calm_factor``, ``leave_contact``.
 
         Raises:
             ApexError: The start, the goal, the planner, a parameter or the name of an option is faulty.
@@ -292,7 +298,10 @@ class MotionPlanner:
 
                 among_dynamic_obstacles.warm_up(checker)
             times = {"setup": time.perf_counter() - started}
-            query = steps.check(setup, parameters, timeout=options.timeout, started=started, times=times, notes=notes)
+            query = steps.check(
+                setup, parameters, timeout=options.timeout, objective=options.objective,
+                calm_factor=options.calm_factor, started=started, times=times, notes=notes,
+            )  # fmt: skip
             preparing.close()
             with Interrupt() as query.interrupt, running(query.interrupt.end):
                 if dynamic and timing is not None:

@@ -40,12 +40,14 @@ from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
 from apex_ompl.paths.path import Path
 from apex_ompl.planners import AnyPlanner, Parameters
 from apex_ompl.planning.departure import remedy
+from apex_ompl.planning.motions import knows_obstacles, optimized_motion
 from apex_ompl.planning.query import Group, planned_joints
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.duration import CALM_FACTOR, DEFAULT_OBJECTIVE, check_objective
 from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
@@ -71,6 +73,8 @@ class PlanQuery:
         planner: Name of the planner.
         parameters: Its parameters.
         deadline: When the plan is to be ready.
+        objective: What the motion is to be, one of :data:`apex_ompl.timing.duration.OBJECTIVES`.
+        calm_factor: Duration of a calm motion as a multiple of the fastest one's.
         status: INVALID_START or INVALID_GOAL, or None.
         reason: Why it is one of these, in one sentence.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started [s].
@@ -86,6 +90,8 @@ class PlanQuery:
     planner: str
     parameters: Parameters
     deadline: Deadline
+    objective: str = DEFAULT_OBJECTIVE
+    calm_factor: float = CALM_FACTOR
     status: PlanStatus | None = None
     reason: str = ""
     started: float = 0.0
@@ -154,12 +160,15 @@ class FoundPath:
             held_joints=tuple(robot.joint_names[k] for k in query.setup.held),
             robot_digest=digest(robot),
         )  # fmt: skip
-        if proof is None:
-            return result
-        return replace(
-            result, clearance=proof.clearance, clearance_bound=proof.clearance_bound, clearance_pair=proof.pair,
-            proved_by_spheres=proof.by_spheres,
-        )  # fmt: skip
+        return result if proof is None else replace(result, **certificate(proof))
+
+
+def certificate(proof: PathProof) -> dict[str, Any]:
+    """Return what a result says of the certificate of its path."""
+    return {
+        "clearance": proof.clearance, "clearance_bound": proof.clearance_bound, "clearance_pair": proof.pair,
+        "proved_by_spheres": proof.by_spheres,
+    }  # fmt: skip
 
 
 class ProvedPath(FoundPath):
@@ -194,6 +203,7 @@ def assemble(
 
 def check(
     setup: PlanningSetup, planner: AnyPlanner = NAME, *, params: Mapping[str, Any] | None = None, timeout: float = 5.0,
+    objective: str = DEFAULT_OBJECTIVE, calm_factor: float = CALM_FACTOR,
     started: float | None = None, times: Mapping[str, float] | None = None, notes: Sequence[str] = (),
 ) -> PlanQuery:  # fmt: skip
     """Check the start, the goals and the planner's parameters, and start the time of the plan.
@@ -203,19 +213,25 @@ def check(
         planner: Name of a planner, its parameters, or a function that makes one for OMPL's space information.
         params: Parameters of the planner by name.
         timeout: Seconds for the steps that follow.
+        objective: What the motion is to be, see :func:`apex_ompl.plan`.
+        calm_factor: Duration of a calm motion as a multiple of the fastest one's.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started, by default now [s].
         times: Seconds by stage so far.
         notes: What a user should know about this plan.
 
     Raises:
-        ApexError: The planner or a parameter is unknown or faulty.
+        ApexError: The planner, the objective or a parameter is unknown or faulty.
     """
     check_positive(timeout, "timeout", "a positive number of seconds")
+    check_objective(objective, calm_factor)
     started = clock.perf_counter() if started is None else started
     parameters = planners.chosen(planner, params, seed=setup.seed)
     status, reason = query_fault(setup)
     name, spent = parameters.name or UNNAMED, dict(times or {})
-    return PlanQuery(setup, name, parameters, Deadline(timeout), status, reason, started, spent, list(notes))
+    deadline = Deadline(timeout)
+    return PlanQuery(
+        setup, name, parameters, deadline, objective, calm_factor, status, reason, started, spent, list(notes)
+    )
 
 
 def query_fault(setup: PlanningSetup) -> tuple[PlanStatus | None, str]:
@@ -311,9 +327,11 @@ def prove(found: FoundPath, simplify: bool = True) -> ProvedPath:
 
 
 def time(proved: ProvedPath, timing: bool | Timing = True) -> PlanResult:
-    """Return the result of a plan: the path timed, or with the status TIMEOUT or TIMING_FAILED.
+    """Return the result of a plan: its motion by the query's objective, or the status TIMEOUT or TIMING_FAILED.
 
-    The motion keeps the limits and is proved free along its own cubic pieces.
+    The motion keeps the limits and is proved free along its own cubic pieces. With the objective ``length``, where the
+    start moves, where a checker that is not this project's decides, or where no motion by the objective is proved, it
+    follows the path; else the path of the result is the motion's own.
 
     Args:
         proved: What :func:`prove` returned; without an exact path nothing is timed.
@@ -453,32 +471,41 @@ def _checked(found: FoundPath, path: Path) -> ProvedPath:
 
 
 def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> PlanResult:
-    """Return a result with the motion along its path, or why there is none."""
+    """Return a result with its motion, or why there is none."""
     setup, limits, names = query.setup, query.setup.robot.limits, query.setup.robot.joint_names
-    proof, found = dict[str, float](), list[FullCheck]()
+    proof, found = {"motion": 0.0}, list[FullCheck]()
+    scaled = timing.limits(limits, names)
+
+    def check(motion: Trajectory) -> FullCheck:
+        with timed(proof, "motion"):
+            over = [f"{name} {share:.4f}" for name, share in motion.use(scaled).items() if share > 1.0 + ROUNDING]
+            if over:
+                return FullCheck(False, f"the share of a limit that it uses is over 1: {', '.join(over)}", None)
+            return full_check(setup.checker, motion, setup.start, setup.goals, deadline=query.deadline.at)
 
     def fault(motion: Trajectory) -> str:
-        with timed(proof, "motion"):
-            shares = motion.use(timing.limits(limits, names))
-            over = [f"{name} {share:.4f}" for name, share in shares.items() if share > 1.0 + ROUNDING]
-            if over:
-                return f"the share of a limit that it uses is over 1: {', '.join(over)}"
-            check = full_check(setup.checker, motion, setup.start, setup.goals, deadline=query.deadline.at)
-            found.append(check)
-            return check.reason
+        found.append(check(motion))
+        return found[-1].reason
 
+    by_objective = query.objective != "length" and timing.start(scaled) is None and knows_obstacles(setup)
     try:
         with timed(query.times, "timing"):
-            made = time_path(path, limits, names, timing, fault, stop=query.ends)
+            better = optimized_motion(query, path, timing, check) if by_objective else None
+            straight = len(path.states) == 2 and query.objective != "calm"  # Ruckig's profile may be faster
+            made = time_path(path, limits, names, timing, fault, stop=query.ends) if straight or not better else None
     except TimingStoppedError:
         return replace(result, status=PlanStatus.TIMEOUT, reason=NOT_TIMED)
     except TimingError as error:
         return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
     finally:
-        query.times["timing"] -= proof.get("motion", 0.0)
-        query.times["timing proof"] = proof.get("motion", 0.0)
-    motion = made.trajectory
+        query.times["timing"] -= proof["motion"]
+        query.times["timing proof"] = proof["motion"]
+    motion_proof = found[-1].proof if found else None
+    if better is not None and (made is None or better.timed.trajectory.duration < made.trajectory.duration):
+        made, motion_proof = better.timed, better.motion_proof
+        result = replace(result, path=better.path, **certificate(better.path_proof))
+    assert made is not None
     return replace(
-        result, trajectory=motion, limit_use=motion.use(limits), deviation=made.deviation, timing_method=made.method,
-        motion_clearance=nan if found[-1].proof is None else found[-1].proof.clearance,
+        result, trajectory=made.trajectory, limit_use=made.trajectory.use(limits), deviation=made.deviation,
+        timing_method=made.method, motion_clearance=nan if motion_proof is None else motion_proof.clearance,
     )  # fmt: skip

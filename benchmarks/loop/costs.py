@@ -41,17 +41,18 @@ from apex_ompl.loop.replan.sources import Proposals, Sprint
 from apex_ompl.moving.compute_costs import TABLE, ComputeBudget, cost_table
 from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time, curve_of, prove_motion
+from apex_ompl.moving.motion_optimizer import MotionOptimizer
 from apex_ompl.moving.replanner import Request
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.search import AGE, GUARDED, MOTIONS, SPREAD, Search
 from apex_ompl.moving.settings import LoopSettings
-from apex_ompl.moving.timed_spline import MotionOptimizer, Start, TimedSpline
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.problems import worlds
 from apex_ompl.timing import time_path
 from apex_ompl.timing.ruckig_method import between, through
+from apex_ompl.timing.timed_spline import Start, TimedSpline
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically

@@ -16,8 +16,8 @@ from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.result import Outcome
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
-from apex_ompl.moving.timed_spline import Start
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.timing.timed_spline import Start
 
 CONTROLS = ("mppi", "potential-field", "drrt", "damon")
 MOVING = "vertical/moving-medium-0.1/800000"

@@ -18,13 +18,13 @@ from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.settings import LoopSettings
-from apex_ompl.moving.timed_spline import Start, TimedSpline
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.problems.world_scripts import environment_of
 from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.spline_method import least_knot_spacing
+from apex_ompl.timing.timed_spline import Start, TimedSpline
 
 PROBLEM, BLOCKED = "vertical/free/1", "vertical/free/0"  # the straight line is free, and meets what stands still
 Find = Callable[[RunContext, Request], Following | None]

@@ -32,11 +32,11 @@ from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_ti
 from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.search import EARLIER, Search
 from apex_ompl.moving.settings import EVADE, LoopSettings
-from apex_ompl.moving.timed_spline import Start
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.timing import Trajectory
+from apex_ompl.timing.timed_spline import Start
 from apex_ompl.timing.trajectory import is_at_rest
 
 

@@ -18,8 +18,8 @@ from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.replanner import Request
 from apex_ompl.moving.search import Search
-from apex_ompl.moving.timed_spline import Start
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.timing.timed_spline import Start
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.replanner import Request
 from apex_ompl.moving.search import EARLIER, Search
-from apex_ompl.moving.timed_spline import Start, TimedSpline
 from apex_ompl.timing.spline_method import least_knot_spacing
+from apex_ompl.timing.timed_spline import Start, TimedSpline
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,10 @@ from functools import cached_property
 import numpy as np
 
 from apex_ompl.moving.search import Search, shortest_duration
-from apex_ompl.moving.timed_spline import Start, TimedSpline
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.timing.spline_method import least_knot_spacing, start_points
+from apex_ompl.timing.timed_spline import Start, TimedSpline
 from apex_ompl.types import Array
 
 Control = Callable[[int, Array, Array], Array]

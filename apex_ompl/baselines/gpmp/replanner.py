@@ -16,9 +16,9 @@ from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
 from apex_ompl.moving.search import STATES, InitialMotion, Search, rest_of_route, shortest_duration
-from apex_ompl.moving.timed_spline import PINNED, Start, TimedSpline
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing
+from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline
 from apex_ompl.types import Array
 
 WORK = "state of a factor graph"

@@ -75,6 +75,14 @@ PLANS = Group(
         },
         {
             "check.curve_proof.prove_curve": (ROBOT + SCENE + ROBOT + "i8[::1], " + 3 * ROBOT + CURVE, 18),
+            "timing.duration_optimization.lower_duration": (
+                ROBOT
+                + SCENE
+                + WORKSPACE
+                + "f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], i8, f8, f8[:, ::1], "
+                + "Tuple((f8, f8, f8, f8, f8, f8, f8, f8, f8, i8)), i8[::1], f8[::1]",
+                8,
+            ),
         },
         {
             "check.queries.joint_frames": (ROBOT + WORKSPACE + "f8[:, ::1], f8[:, :, :, ::1], f8[:, :, ::1]", 2),

@@ -11,10 +11,10 @@ import numpy as np
 from apex_ompl.loop.replan.evasion import URGENT, endangered, step_aside, threatened, wait_nearer
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import RunContext
+from apex_ompl.moving.motion_optimizer import MOST_ROUNDS, MotionCandidate, MotionPool
 from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.search import Search, Source
-from apex_ompl.moving.timed_spline import MOST_ROUNDS, MotionCandidate, MotionPool
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.ruckig_method import through
 from apex_ompl.types import Array

@@ -62,7 +62,7 @@ def add_violation(clearance: float, margin: float, row: Floats, gradient: Floats
 
 
 @reassociating_inlined
-def _nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: float) -> Nearest:
+def nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: float) -> Nearest:
     """Return the nearest leaves of pair ``p`` of clusters, if they are less than ``margin`` apart."""
     near: Nearest = (margin, -1, -1, -1, -1)
     a, b = t.pair_clusters[p, 0], t.pair_clusters[p, 1]
@@ -118,7 +118,7 @@ def state_cost(
                     gradient_to_obstacle(t, s, w, near, row)
                     cost += add_violation(clearance, scene_margin, row, gradient, gram)
     for p in range(len(t.pair_common)):
-        near = _nearest_of_pair(t, w, q, p, own_margin)
+        near = nearest_of_pair(t, w, q, p, own_margin)
         if near[1] >= 0:
             own = min(own, near[0])
             for i in range(len(row)):

@@ -1,14 +1,13 @@
-"""Optimization in space and time: splines in time among dynamic obstacles, and a pool of candidates.
+"""Optimization in space and time among dynamic obstacles, and a pool of candidates.
 
 A motion starts from a moving state and ends at rest at a goal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,13 +19,11 @@ from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
-from apex_ompl.timing.spline_method import least_knot_spacing, spline_in_time, start_points
+from apex_ompl.timing.spline_method import least_knot_spacing
+from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline, basis, slopes
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_array, check_positive
+from apex_ompl.util.validation import check_array
 
-PINNED = 3  # control points at each end, which are fixed by the state there
-KNOT_SPACING = 0.1  # aimed at [s]
-LEAST_SPANS, MOST_SPANS = 8, 40
 ROUNDS = 4  # rounds of steps of a repair, between which a motion over its limits gets more time
 SLOWER = 1.02  # least factor on its duration then
 ROUND, MOST_ROUNDS = 4, 8  # optimizer steps in a round of a pool, and largest number of rounds of a candidate
@@ -64,83 +61,6 @@ class MotionSettings:
     damping: float = 1e-2
     steps: int = 16
     tolerance: float = 1e-3
-
-
-class Start(NamedTuple):
-    """State in which a motion starts: position, velocity and acceleration, each of shape (dof,)."""
-
-    position: Array
-    velocity: Array
-    acceleration: Array
-
-    @classmethod
-    def at_rest(cls, q: Array) -> Start:
-        """Return rest at a state, shape (dof,)."""
-        return cls(q, np.zeros_like(q), np.zeros_like(q))
-
-    @property
-    def moves(self) -> bool:
-        """Whether it has a velocity or an acceleration."""
-        return bool(self.velocity.any() or self.acceleration.any())
-
-
-class TimedSpline(NamedTuple):
-    """A uniform cubic B-spline in time, from a given state to rest.
-
-    Attributes:
-        control: Control points, shape (P, dof) [rad]; the first three fix the start, the last three are the goal.
-        spacing: Knot spacing [s].
-        start: State in which it starts.
-    """
-
-    control: Array
-    spacing: float
-    start: Start
-
-    @property
-    def duration(self) -> float:
-        """Duration [s]."""
-        return (len(self.control) - PINNED) * self.spacing
-
-    @classmethod
-    def along(cls, states: Array, duration: float, start: Start, goal: Array) -> TimedSpline:
-        """Return the spline whose control points are states of a motion, evenly spaced in time.
-
-        Args:
-            states: States of the motion, evenly spaced in time, shape (N, dof); the first is the start.
-            duration: Its duration [s]; the spline takes a knot spacing longer, since it rounds the end, and another one
-                from rest.
-            start: State in which the spline starts.
-            goal: Where it ends, shape (dof,).
-
-        Raises:
-            ParameterError: ``duration`` is not positive, or the states have another shape.
-        """
-        check_array(states, ("N", len(goal)), "states", finite=True, least=2)
-        check_positive(duration, "duration")
-        count = int(np.clip(round(duration / KNOT_SPACING), LEAST_SPANS, MOST_SPANS))
-        spacing = float(duration / count)
-        given, wanted = np.linspace(0.0, 1.0, len(states)), np.linspace(0.0, 1.0, count + 1)
-        states = np.stack([np.interp(wanted, given, column) for column in states.T], axis=1)
-        before = 1 if start.moves else 2  # at rest the first three control points are one
-        control = np.concatenate([np.repeat(states[:1], before, axis=0), states, states[-1:], states[-1:]])
-        control[-PINNED:] = goal
-        return cls(control, spacing, start).lasting(spacing)
-
-    def lasting(self, spacing: float) -> TimedSpline:
-        """Return the spline with another knot spacing [s] and the same start."""
-        control = self.control.copy()
-        control[:PINNED] = start_points(self.start, spacing)
-        if not self.start.moves:
-            control[:PINNED] = self.start.position
-        return TimedSpline(control, spacing, self.start)
-
-    def trajectory(self, joint_names: Sequence[str]) -> Trajectory:
-        """Return the motion itself; start and end are exact, and so are joints that stay."""
-        motion = spline_in_time(self.control, self.spacing, tuple(joint_names), self.start)
-        inner = motion.positions[1:-1]  # averages of control points
-        np.clip(inner, self.control.min(axis=0), self.control.max(axis=0), out=inner)
-        return motion
 
 
 class MotionOptimizer:
@@ -258,25 +178,15 @@ def _grid(points: int, samples: int) -> PathGrid:
     """Return weights at the samples, where they start, and the matrix of the speed over the share of the motion."""
     spans = points - PINNED
     at = (np.arange(samples) + 0.5) / samples
-    weights = np.tile(_basis(at), (spans, 1))
+    weights = np.tile(basis(at), (spans, 1))
     first = np.repeat(np.arange(spans), samples)
     nodes, shares = np.polynomial.legendre.leggauss(SAMPLE_WIDTH)
-    slopes = _slopes((nodes + 1.0) / 2.0) * spans
-    block = (slopes.T * (shares / 2.0 / spans)) @ slopes
+    rates = slopes((nodes + 1.0) / 2.0) * spans
+    block = (rates.T * (shares / 2.0 / spans)) @ rates
     gram = np.zeros((points, points))
     for k in range(spans):
         gram[k : k + SAMPLE_WIDTH, k : k + SAMPLE_WIDTH] += block
     return PathGrid(np.ascontiguousarray(weights), first.astype(np.int64), gram)
-
-
-def _basis(x: Array) -> Array:
-    """Return the weights of the four control points of a span at shares of it, shape (N, 4)."""
-    return np.stack([(1 - x) ** 3, 3 * x**3 - 6 * x**2 + 4, -3 * x**3 + 3 * x**2 + 3 * x + 1, x**3], axis=1) / 6.0
-
-
-def _slopes(x: Array) -> Array:
-    """Return the derivatives of :func:`_basis` with respect to the share, shape (N, 4)."""
-    return np.stack([-((1 - x) ** 2), 3 * x**2 - 4 * x, -3 * x**2 + 2 * x + 1, x**2], axis=1) / 2.0
 
 
 @dataclass(eq=False)

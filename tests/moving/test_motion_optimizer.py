@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
-from apex_ompl.moving.timed_spline import MotionOptimizer, MotionSettings, Start, TimedSpline, _grid
+from apex_ompl.moving.motion_optimizer import MotionOptimizer, MotionSettings, _grid
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Trajectory
+from apex_ompl.timing.timed_spline import Start, TimedSpline
 
 
 @pytest.fixture(scope="module")

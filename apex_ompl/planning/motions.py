@@ -1,0 +1,143 @@
+"""The motion of a plan: duration or calm as the objective, proved along its own curve.
+
+The motion starts from the path that was found. Where it ends at one of several goals, straight motions to others that
+could be reached sooner are tried, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from apex_ompl.collision.path_proof import PathProof
+from apex_ompl.ompl.setup import PlanningSetup
+from apex_ompl.ompl.validity import FullCheck, MotionValidator, StateValidityChecker, full_check
+from apex_ompl.paths.path import Path
+from apex_ompl.robot.model import Limits
+from apex_ompl.timing import TimedPath, Timing, Trajectory
+from apex_ompl.timing.duration import DurationOptimizer, direct_durations
+from apex_ompl.timing.timed_spline import TimedSpline
+from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.planning.steps import PlanQuery
+
+OPTIMIZED = "optimized"  # form of a motion that is not along a path
+REPAIRS = 3  # of a motion that is not proved
+GOALS = 3  # other goals to which a straight motion is tried
+SOONER = 0.95  # share of the duration that the lower bound of another goal must not reach
+STATES_PER_KNOT = 2, 4, 8  # of the path along a motion; the first that passes the full check
+SHARE = 0.5  # of the time left
+
+
+Check = Callable[[Trajectory], FullCheck]
+"""Full check of a motion, its limits among it."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProvedMotion:
+    """A motion, the path along it, and the certificates of both."""
+
+    timed: TimedPath
+    path: Path
+    motion_proof: PathProof
+    path_proof: PathProof
+
+
+def knows_obstacles(setup: PlanningSetup) -> bool:
+    """Whether this project's checkers alone decide what is valid."""
+    si = setup.simple_setup.getSpaceInformation()
+    checker, validator = si.getStateValidityChecker(), si.getMotionValidator()
+    return type(checker) is StateValidityChecker and type(validator) is MotionValidator
+
+
+def optimized_motion(query: PlanQuery, path: Path, timing: Timing, check: Check) -> ProvedMotion | None:
+    """Return a motion by the query's objective, or None where none is proved in time.
+
+    Args:
+        query: The query.
+        path: A valid path.
+        timing: The limits.
+        check: Full check of a motion.
+    """
+    setup = query.setup
+    limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
+    held = np.zeros(setup.robot.dof, bool)
+    held[setup.held] = True
+    optimizer = DurationOptimizer(setup.checker.kernel, limits, held)
+    reserve = query.deadline.remaining * (1.0 - SHARE)
+
+    def stop() -> bool:
+        return query.ends() or query.deadline.remaining < reserve
+
+    found = _proved(optimizer, optimizer.fastest(path.states, stop), check, stop)
+    for goal in _sooner_goals(setup, path, limits, found):
+        if stop():
+            break
+        other = _proved(optimizer, optimizer.fastest(np.stack([setup.start, goal]), stop), check, stop, repairs=1)
+        if other is not None and (found is None or other[0].duration < found[0].duration):
+            found = other
+    if found is not None:
+        factor = query.calm_factor if query.objective == "calm" else 1.0
+        duration = max(factor * found[0].duration, timing.minimum_duration)
+        if duration > found[0].duration:
+            calm = query.objective == "calm" and not stop()
+            spline = found[0].lasting(duration / found[0].spans)
+            same = _proved(optimizer, spline, check, stop, repairs=0)
+            made = _proved(optimizer, optimizer.calmest(spline, duration), check, stop, repairs=0) if calm else None
+            found = made or same
+    return None if found is None else _with_path(setup, timing, *found)
+
+
+Proved = tuple[TimedSpline, Trajectory, PathProof]
+
+
+def _proved(
+    optimizer: DurationOptimizer, spline: TimedSpline | None, check: Check, stop: Callable[[], bool],
+    repairs: int = REPAIRS,
+) -> Proved | None:  # fmt: skip
+    """Return a motion that passed the full check, or None."""
+    names = optimizer.kernel.robot.joint_names
+    for turn in range(1, repairs + 2):
+        if spline is None or stop():
+            return None
+        motion = spline.trajectory(names)
+        checked = check(motion)
+        if checked and checked.proof is not None:
+            return spline, motion, checked.proof
+        if turn <= repairs:
+            spline = optimizer.cleared(spline, turn)
+    return None
+
+
+def _sooner_goals(setup: PlanningSetup, path: Path, limits: Limits, found: Proved | None) -> Iterator[Array]:
+    """Yield other goals that could be reached sooner, the nearest in time first."""
+    goals = setup.valid_goals
+    if len(goals) < 2:
+        return
+    durations = direct_durations(setup.start, goals, limits)
+    most = np.inf if found is None else SOONER * found[0].duration
+    for k in np.argsort(durations, kind="stable")[:GOALS]:
+        if durations[k] < most and not np.array_equal(goals[k], path.states[-1]):
+            yield goals[k]
+
+
+def _with_path(
+    setup: PlanningSetup, timing: Timing, spline: TimedSpline, motion: Trajectory, proof: PathProof
+) -> ProvedMotion | None:
+    """Return a motion with the path through its own states, or None where none passes the full check."""
+    del spline
+    for count in STATES_PER_KNOT:
+        times = np.linspace(0.0, motion.duration, count * (len(motion.times) - 1) + 1)
+        states = motion(times)
+        states[0], states[-1] = motion.positions[0], motion.positions[-1]
+        limits = setup.robot.limits
+        states = states.clip(limits.lower, limits.upper)
+        checked = full_check(setup.checker, states, setup.start, setup.goals)
+        if checked and checked.proof is not None:
+            timed = TimedPath(motion, 0.0, timing.method, OPTIMIZED)
+            return ProvedMotion(timed, Path(states), proof, checked.proof)
+    return None

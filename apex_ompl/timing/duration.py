@@ -1,0 +1,229 @@
+"""Duration as the objective: motions from rest to rest, as fast or as calm as limits and obstacles allow.
+
+A motion is a spline in time (:class:`apex_ompl.timing.timed_spline.TimedSpline`). Its control points and its knot
+spacing are optimized together by an interior-point method
+(:mod:`apex_ompl.kernel.compiled.timing.duration_optimization`) with the limits of velocity, acceleration and jerk and
+the clearances at its samples as constraints: first with few knots, then with more. What comes out still has to be
+proved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.duration import DurationReport, DurationSettings, TimeGrid, lower_duration
+from apex_ompl.kernel.kernel import Kernel
+from apex_ompl.paths.path import resample
+from apex_ompl.robot.model import Limits
+from apex_ompl.timing.spline_method import least_knot_spacing
+from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline, basis
+from apex_ompl.types import Array, Flags
+from apex_ompl.util.validation import check_name, check_number, check_states
+
+OBJECTIVES = ("time", "length", "calm")
+"""What a plan is to be: fast, short, or calm, which is the least integral of the squared jerk in some more time."""
+
+DEFAULT_OBJECTIVE = "time"
+CALM_FACTOR = 1.1  # duration of a calm motion as a multiple of the fastest one's, by default
+MOST_CALM = 100.0
+
+RAMP = 0.25  # share of the first guess in which its speed grows, and falls
+RAMPS = 0.35  # duration of both [s]
+GUESS_STATES = 257  # of a path
+MARGIN = 0.005  # least clearance at the samples [m]
+CLOSER = 1.05, 0.004  # samples a round of repair adds to the last ones, as a factor, and margin [m]
+MOST_SPANS = 400
+ROUNDING = 1e-9  # share of the knot spacing that keeps rounding within the limits
+PROX = 1e-3
+LARGEST = 0.25  # change of a control point in a step [rad]
+DECREASE = 0.3
+STEPS = 20
+
+
+@dataclass(frozen=True)
+class Level:
+    """Settings of a round of the optimization.
+
+    Attributes:
+        rate: Knots a second, about.
+        samples: Number of samples of a knot spacing.
+        horizon: Clearances above it are left out [m].
+        slack: Factor on the least knot spacing at the start.
+        mean: Mean of slacks times multipliers at the start.
+        tolerance: What the objective may be off the optimum.
+    """
+
+    rate: float
+    samples: int
+    horizon: float
+    slack: float
+    mean: float
+    tolerance: float
+
+
+LEVELS = (
+    Level(10.0, 4, 0.04, 1.03, 1e-4, 4e-2),
+    Level(25.0, 4, 0.02, 1.01, 2e-5, 2e-2),
+    Level(57.0, 2, 0.02, 1.003, 5e-6, 5e-3),
+)
+CALM = Level(57.0, 3, 0.03, 1.0, 1e-4, 2e-2)
+REPAIR = Level(57.0, 4, 0.03, 1.01, 2e-5, 5e-3)
+
+
+def check_objective(objective: str, calm_factor: float) -> None:
+    """Check an objective and the duration of a calm motion as a multiple of the fastest one's.
+
+    Raises:
+        UnknownNameError: No such objective.
+        ParameterError: The factor is not from 1 to 100.
+    """
+    check_name(objective, "objective", OBJECTIVES)
+    check_number(calm_factor, "calm_factor", 1.0, MOST_CALM)
+
+
+class DurationOptimizer:
+    """Makes motions fast, or calm, among the static obstacles of a kernel."""
+
+    def __init__(self, kernel: Kernel, limits: Limits, held: Flags | None = None, margin: float = MARGIN) -> None:
+        """Optimize motions of the kernel's robot.
+
+        Args:
+            kernel: The robot among its obstacles.
+            limits: Limits of the motions.
+            held: Whether joints stay, shape (dof,).
+            margin: Least clearance that is aimed at; nearer ends of a motion are allowed for [m].
+
+        Raises:
+            ParameterError: The limits are those of other joints.
+        """
+        dof = kernel.robot.dof
+        if len(limits.velocity) != dof:
+            raise ParameterError("limits", len(limits.velocity), f"those of {dof} joints")
+        self.kernel, self.limits, self.margin = kernel, limits, margin
+        self._held = np.zeros(dof, bool) if held is None else held
+        self._limits = np.stack([limits.velocity, limits.acceleration, limits.jerk])
+        self._limits[:, self._held] = 0.0
+
+    def fastest(self, states: Array, stop: Callable[[], bool] = lambda: False) -> TimedSpline | None:
+        """Return a locally fastest motion near a path.
+
+        Args:
+            states: The path, shape (N, dof).
+            stop: Called between rounds; True ends the optimization.
+
+        Returns:
+            The motion from the first state to the last, or None where these are one, the path cannot be cleared, or
+            ``stop`` returned True.
+
+        Raises:
+            ParameterError: The path has another shape.
+        """
+        check_states(states, self.kernel.robot.dof, "path", least=1)
+        spline = self._guess(states)
+        for level in LEVELS:
+            if spline is None or stop():
+                return None
+            if level is not LEVELS[0]:
+                spline = self._refitted(spline, level)
+            spline, _ = self._lowered(spline, level)
+        return spline
+
+    def cleared(self, spline: TimedSpline, times: int = 1) -> TimedSpline:
+        """Return a motion that keeps more distance, of more samples, for one that was not proved.
+
+        Args:
+            spline: The motion.
+            times: How often its repair was tried.
+        """
+        better, _ = self._lowered(spline, REPAIR, samples=REPAIR.samples * times, margin=CLOSER[1] * times)
+        return better
+
+    def calmest(self, spline: TimedSpline, duration: float) -> TimedSpline:
+        """Return a motion of a duration [s], longer than that of ``spline``, with a small integral of squared jerk."""
+        spline = spline.lasting(duration / spline.spans)
+        shares = np.diff(spline.control, PINNED, axis=0)[:, ~self._held] / self.limits.jerk[~self._held]
+        total = float((shares**2).sum()) / spline.spacing ** (2 * PINNED)
+        if not total:
+            return spline
+        better, _ = self._lowered(spline, CALM, calm=1.0 / total)
+        return better
+
+    def least_duration(self, spline: TimedSpline) -> float:
+        """Return the least duration within which the control points keep the limits [s]."""
+        return least_knot_spacing(spline.control, self.limits) * spline.spans
+
+    def _guess(self, states: Array) -> TimedSpline | None:
+        """Return a motion along a path whose speed, by the limits of velocity, grows, stays and falls."""
+        states = resample(states, GUESS_STATES)
+        rates = (np.abs(np.diff(states, axis=0)) / self.limits.velocity).max(axis=1)
+        along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(states, axis=0), axis=1)))
+        if not along[-1] > 0.0:
+            return None
+        duration = float(rates.sum()) + RAMPS
+        wanted = along[-1] * _ramped(np.linspace(0.0, 1.0, GUESS_STATES))
+        even = np.stack([np.interp(wanted, along, column) for column in states.T], axis=1)
+        spans = int(np.clip(round(LEVELS[0].rate * duration), 8, MOST_SPANS // 6))
+        return TimedSpline.along(even, duration, Start.at_rest(states[0]), states[-1], spans)
+
+    def _refitted(self, spline: TimedSpline, level: Level) -> TimedSpline:
+        spline = spline.lasting(least_knot_spacing(spline.control, self.limits))
+        wanted = min(MOST_SPANS, int(level.rate * spline.duration))
+        return spline.refitted(max(spline.spans, wanted))
+
+    def _lowered(
+        self, spline: TimedSpline, level: Level, *, calm: float = 0.0, samples: int = 0, margin: float = 0.0
+    ) -> tuple[TimedSpline, DurationReport]:
+        """Return a spline after the steps of a level, in its least duration or with ``calm`` in its own."""
+        control = np.array(spline.control, order="C")
+        control[PINNED:-PINNED] = control[PINNED:-PINNED].clip(self.limits.lower, self.limits.upper)
+        spacing = max(spline.spacing if calm else 0.0, level.slack * least_knot_spacing(control, self.limits))
+        settings = DurationSettings(
+            self.margin + margin, level.horizon + margin, PROX, level.mean, DECREASE, LARGEST, level.tolerance,
+            0.0 if calm else 1.0, calm, STEPS,
+        )  # fmt: skip
+        grid = _grid(len(control), samples or level.samples)
+        report = lower_duration(self.kernel, grid, self._limits, PINNED, control, spacing, settings)
+        least = least_knot_spacing(control, self.limits)
+        final = max(report.spacing, least) if calm else least * (1.0 + ROUNDING)
+        return TimedSpline(control, final, spline.start), report
+
+
+def direct_durations(start: Array, goals: Array, limits: Limits) -> Array:
+    """Return the least durations of motions from rest to rest, obstacles ignored, shape (N,) [s].
+
+    Every joint takes its fastest profile of constant jerks for the distance d: with the ramp a/j of the acceleration
+    T = d/v + v/a + a/j where the largest velocity v is reached, else T = a/j + sqrt((a/j)^2 + 4 d/a) where the largest
+    acceleration a is, else T = (32 d/j)^(1/3); where v < a^2/j, v is reached without a: T = d/v + 2 sqrt(v/j).
+
+    Args:
+        start: Start state, shape (dof,).
+        goals: Goal states, shape (N, dof).
+        limits: Limits of the joints.
+    """
+    d, (v, a, j) = np.abs(goals - start), (limits.velocity, limits.acceleration, limits.jerk)
+    ramp = a / j
+    short = v < a * ramp  # the largest velocity is reached before the largest acceleration
+    reach = np.where(short, 2.0 * v * np.sqrt(v / j), v * (v / a + ramp))  # distance from which v is reached
+    full = np.where(short, d / v + 2.0 * np.sqrt(v / j), d / v + v / a + ramp)
+    ramped = ramp + np.sqrt(ramp**2 + 4.0 * d / a)
+    jerky = np.cbrt(32.0 * d / j)
+    between = np.where(d >= 2.0 * a * ramp**2, ramped, jerky)
+    durations: Array = np.where(d >= reach, full, np.where(short, jerky, between)).max(axis=1)
+    return durations
+
+
+def _ramped(share: Array) -> Array:
+    """Return the share of the way after a share of the time, with ramps of speed at both ends."""
+    speed = 1.0 / (1.0 - RAMP)
+    first, last = speed * share**2 / (2.0 * RAMP), 1.0 - speed * (1.0 - share) ** 2 / (2.0 * RAMP)
+    return np.where(share < RAMP, first, np.where(share > 1.0 - RAMP, last, speed * (share - RAMP / 2.0)))
+
+
+@lru_cache(maxsize=64)
+def _grid(points: int, samples: int) -> TimeGrid:
+    return TimeGrid.of(points, samples, basis((np.arange(samples) + 0.5) / samples))
