@@ -42,7 +42,7 @@ ROUNDING = 1e-9  # share of the knot spacing that keeps rounding within the limi
 PROX = 1e-3
 LARGEST = 0.25  # change of a control point in a step [rad]
 DECREASE = 0.3
-STEPS = 20
+STEPS = 30
 
 
 @dataclass(frozen=True)
