@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import linprog
 from support import distance
 
-from apex_ompl.kernel.compiled.timing.time_parameterization import max_distance, max_path_speeds, sample_times
+from apex_ompl.kernel.compiled.timing.time_parameterization import max_distance, sample_times
+from apex_ompl.kernel.timing import max_path_speeds
 from apex_ompl.timing.curve import Curve, Polyline
 
 VELOCITY, ACCELERATION = np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0])
@@ -21,8 +22,7 @@ def test_path_speeds_are_those_of_a_linear_program(seed: int) -> None:
     curve = Curve.along(Polyline.through(path), 0.5)
     first, second = curve.derivatives(12)
     n, step = len(first), curve.spacing / 12
-    x = np.empty(n)
-    max_path_speeds(first, second, VELOCITY, ACCELERATION, step, x)
+    x = max_path_speeds(first, second, VELOCITY, ACCELERATION, step)
     rows, bounds = [], []
     for i in range(n - 1):  # |q' u + q'' x| <= a with u = (x[i + 1] - x[i]) / (2 step)
         for j in range(3):
