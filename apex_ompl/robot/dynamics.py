@@ -106,9 +106,9 @@ class Dynamics:
             v: Velocities, shape (N, dof).
         """
         model, data, order = self._model, self._data, self.robot.to_pinocchio
-        found = np.empty((len(q), len(self._points)))
-        for k, row in enumerate(zip(order(q), order(v), strict=True)):
-            pin.forwardKinematics(model, data, *row)
+        velocities = np.empty((len(q), len(self._points), 3))
+        for row, *at in zip(velocities, order(q), order(v), strict=True):
+            pin.forwardKinematics(model, data, *at)
             for n, frame in enumerate(self._points):
-                found[k, n] = np.linalg.norm(pin.getFrameVelocity(model, data, frame, pin.LOCAL).linear)
-        return found
+                row[n] = pin.getFrameVelocity(model, data, frame, pin.LOCAL).linear
+        return np.asarray(np.linalg.norm(velocities, axis=2))

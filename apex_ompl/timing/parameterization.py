@@ -45,6 +45,8 @@ DEFAULT_METHOD = "ruckig"
 SHORTEST_DURATION = 1e-3  # of a motion between states that count as the same [s]
 FALLBACK = "spline"  # where the given method has no blended motion
 SAME_DURATION = 1.02  # ratio of durations up to which a motion is not timed again for limits of torques and tool speeds
+SLOWED_AGAIN = 3  # times that a motion is slowed down to limits, which are sampled anew each time
+MOVING_START_SHARES = (1.0, 0.5, 0.25)  # shares of the acceleration limits from a moving start, while a torque is over
 BLENDS = 8  # deviations that are tried, each half of the one before, until the motion stops at corners
 LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rounding [rad]
 LIMITS = ("velocity", "acceleration", "jerk")
@@ -266,14 +268,17 @@ def time_path(
     scaled = timing.limits(limits, joint_names)
     _check(states, limits, joint_names)
     start = timing.start(scaled)
-    reason, line = "" if motion_limits is None else motion_limits.gravity_fault(states), Polyline.through(states)
+    line, reason = Polyline.through(states), "" if motion_limits is None else motion_limits.gravity_fault(states)
     if reason:
         raise TimingError(reason)
     for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop=stop, more=motion_limits):
         rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration))
-        for candidate in [rest] if start is None else _from_moving_start(start, rest, line, scaled, timing, stop=stop):
-            reason = "" if start is None or motion_limits is None else motion_limits.fault(candidate.trajectory)
-            reason = reason or fault(candidate.trajectory)
+        for candidate in (
+            [rest]
+            if start is None
+            else _from_moving_start(start, rest, line, scaled, timing, stop=stop, more=motion_limits)
+        ):
+            reason = fault(candidate.trajectory)
             if not reason:
                 return candidate
             if stop():
@@ -286,7 +291,7 @@ def time_path(
 def _by_name(timing: Timing, field: str) -> Mapping[str, float]:
     given = getattr(timing, field)
     if not isinstance(given, Mapping):
-        raise ParameterError(field, given, "numbers by name")
+        raise ParameterError(field, given, "masses by hand or link" if field == "payload" else "values by joint name")
     return given
 
 
@@ -322,9 +327,9 @@ def _from_rest(
         return
     stopping, factor = _slowed(TimedPath(*motion, "ruckig", "line" if straight else "stops"), more)
     if straight and factor > SAME_DURATION:
-        blended = _blended(line, limits, joint_names, timing.method, timing.deviation, stop=stop, more=more)
+        blended = _blended(line, limits, joint_names, "spline", timing.deviation, stop=stop, more=more)
         if blended is not None and blended.trajectory.duration < stopping.trajectory.duration:
-            yield blended
+            yield replace(blended, form="line")
     yield stopping
 
 
@@ -356,15 +361,22 @@ def _slowed(timed: TimedPath, more: MotionLimits | None) -> tuple[TimedPath, flo
     Raises:
         TimingError: Gravity alone exceeds a limit.
     """
-    factor = 1.0 if more is None else more.stretch(timed.trajectory)
-    if not np.isfinite(factor):
-        raise TimingError("gravity alone exceeds a limit of torque along the motion")
-    return timed if factor == 1.0 else replace(timed, trajectory=timed.trajectory.slower(factor)), factor
+    if more is None:
+        return timed, 1.0
+    motion = timed.trajectory
+    for _ in range(SLOWED_AGAIN):
+        factor = more.stretch(motion)
+        if not np.isfinite(factor):
+            raise TimingError("gravity alone exceeds a limit of torque along the motion")
+        if factor == 1.0:
+            break
+        motion = motion.slower(factor)
+    return replace(timed, trajectory=motion), motion.duration / timed.trajectory.duration
 
 
 def _from_moving_start(
     start: tuple[Array, Array], timed: TimedPath, line: Polyline, limits: Limits, timing: Timing,
-    *, stop: Callable[[], bool],
+    *, stop: Callable[[], bool], more: MotionLimits | None,
 ) -> list[TimedPath]:  # fmt: skip
     """Return motions from a moving start: those within the deviation, fastest first, then the others, nearest first.
 
@@ -375,15 +387,28 @@ def _from_moving_start(
         limits: The scaled limits.
         timing: How the path is timed.
         stop: Called often; True ends the search.
+        more: Limits of torques and tool speeds.
+
+    Raises:
+        TimingError: All of them exceed a limit of torque or tool speed.
     """
-    candidates = []
-    for motion, join_time in from_moving_start(*start, timed.trajectory, limits, timing.minimum_duration):
-        if stop():
+    candidates, reason = [], ""
+    for share in MOVING_START_SHARES if more is not None else (1.0,):
+        within = replace(limits, acceleration=share * limits.acceleration)
+        for motion, join_time in from_moving_start(*start, timed.trajectory, within, timing.minimum_duration):
+            if stop():
+                break
+            reason = "" if more is None else more.fault(motion)
+            if reason:
+                continue
+            arc_at = np.array([0.0, join_time]), np.zeros(2)  # it may be near any point of the path
+            head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation, stop=stop)
+            deviation, form = max(head_deviation, timed.deviation), f"moving start, {timed.form}"
+            candidates.append(replace(timed, trajectory=motion, deviation=deviation, form=form))
+        if candidates or not reason:
             break
-        arc_at = np.array([0.0, join_time]), np.zeros(2)  # it may be near any point of the path
-        head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation, stop=stop)
-        deviation = max(head_deviation, timed.deviation)
-        candidates.append(replace(timed, trajectory=motion, deviation=deviation, form=f"moving start, {timed.form}"))
+    if reason and not candidates and not stop():
+        raise TimingError(reason)
     return sorted(candidates, key=lambda made: (max(made.deviation, timing.deviation), made.trajectory.duration))
 
 

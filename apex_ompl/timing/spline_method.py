@@ -100,7 +100,8 @@ def blend(
             points = curve.points(arc)
             points[0], points[-1] = line.states[0], line.states[-1]
             control = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])
-            tried[index] = (least_knot_spacing(control, limits), control, arc)
+            least = least_knot_spacing(control, limits)
+            tried[index] = (least if rows is None else max(least, duration / count), control, arc)
         least, control, _ = tried[index]
         return least * (len(control) - 3) if least > 0.0 else math.inf  # 0 at the ends of a closed path
 
