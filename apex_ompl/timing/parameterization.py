@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -47,6 +48,7 @@ FALLBACK = "spline"  # where the given method has no blended motion
 SAME_DURATION = 1.02  # ratio of durations up to which a motion is not timed again for limits of torques and tool speeds
 SLOWED_AGAIN = 3  # times that a motion is slowed down to limits, which are sampled anew each time
 MOVING_START_SHARES = (1.0, 0.5, 0.25)  # shares of the acceleration limits from a moving start, while a torque is over
+FIT_SPACING = 0.01  # of states of a motion whose path is timed anew [s]
 BLENDS = 8  # deviations that are tried, each half of the one before, until the motion stops at corners
 LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rounding [rad]
 LIMITS = ("velocity", "acceleration", "jerk")
@@ -288,6 +290,37 @@ def time_path(
     raise TimingError(reason or "no motion from the velocity at the start stays within the limits")
 
 
+def fitted(
+    motion: Trajectory, limits: Limits, more: MotionLimits, timing: Timing | None = None,
+    *, stop: Callable[[], bool] = lambda: False,
+) -> TimedPath:  # fmt: skip
+    """Return a motion from rest to rest along the path of another one that keeps limits of torques and tool speeds.
+
+    It is the motion itself where it keeps them, else the faster of the motion slowed down as a whole and of a motion
+    timed along its path, by the method of ``timing``, with these limits in the reachability analysis. The second
+    deviates from the path, so that it must be checked for collisions anew.
+
+    Args:
+        motion: Motion from rest to rest within the limits of its joints.
+        limits: The scaled limits of the joints.
+        more: Limits of torques and tool speeds.
+        timing: Method and allowed deviation.
+        stop: Called often; where it returns True, the slowed motion is returned.
+
+    Raises:
+        TimingError: Gravity alone exceeds a limit.
+    """
+    timing = timing or Timing()
+    slowed, factor = _slowed(TimedPath(motion, 0.0, timing.method, "slowed"), more)
+    if factor <= SAME_DURATION:
+        return slowed
+    line = Polyline.through(motion(np.linspace(0.0, motion.duration, math.ceil(motion.duration / FIT_SPACING) + 1)))
+    blended = _blended(
+        line, limits, motion.joint_names, timing.method, timing.deviation, stop=stop, more=more, plain=False
+    )
+    return slowed if blended is None or blended.trajectory.duration >= slowed.trajectory.duration else blended
+
+
 def _by_name(timing: Timing, field: str) -> Mapping[str, float]:
     given = getattr(timing, field)
     if not isinstance(given, Mapping):
@@ -335,15 +368,16 @@ def _from_rest(
 
 def _blended(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], method: str, deviation: float,
-    *, stop: Callable[[], bool], more: MotionLimits | None,
+    *, stop: Callable[[], bool], more: MotionLimits | None, plain: bool = True,
 ) -> TimedPath | None:  # fmt: skip
     """Return the blended motion of a method, or of ``FALLBACK`` where it has none; the fastest that keeps ``more``.
 
-    A motion that need not be slowed down is returned at once.
+    A motion that need not be slowed down is returned at once. With ``plain`` one that is made without ``more`` is tried
+    first.
     """
     fastest: TimedPath | None = None
     for way in dict.fromkeys((method, FALLBACK)):
-        for rows in (None,) if more is None else (None, more):
+        for rows in dict.fromkeys((None, more) if plain else (more,)):
             motion = METHODS[way](line, limits, joint_names, deviation, stop, more=rows)
             if motion is None:
                 break

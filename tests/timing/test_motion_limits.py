@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import distance
 
 from apex_ompl.errors import ApexError, ParameterError, RobotError, TimingError, UnknownNameError
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.timing import MotionLimits, TimedPath, Timing, Trajectory, time_path
+from apex_ompl.timing.parameterization import fitted
 
 PAYLOAD = {"left_hand": 2.5, "right_hand": 2.5}
 DENSE = 0.0005  # [s]
@@ -126,6 +128,23 @@ def test_straight_lines_keep_the_limits(robot: Robot) -> None:
     direction = (path[1] - path[0]) / np.linalg.norm(path[1] - path[0])
     moved = made.trajectory(np.linspace(0.0, made.trajectory.duration, 500)) - path[0]
     np.testing.assert_allclose(moved, np.outer(moved @ direction, direction), atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_motion_is_fitted_into_the_limits_along_its_path(robot: Robot, seed: int) -> None:
+    timing = Timing("spline", payload=PAYLOAD, deviation=0.02)
+    limits = timing.motion_limits(robot)
+    assert limits is not None
+    motion = timed(robot, random_path(robot, seed), Timing("spline")).trajectory
+    made = fitted(motion, robot.limits, limits, timing)
+    assert made.form == "blended" and not limits.fault(made.trajectory)
+    assert max(made.trajectory.use(robot.limits).values()) <= 1.0 + 1e-9
+    assert made.trajectory.duration < 0.95 * motion.duration * limits.stretch(motion)
+    np.testing.assert_array_equal(made.trajectory.positions[[0, -1]], motion.positions[[0, -1]])
+    dense = [some(np.linspace(0.0, some.duration, 2000)) for some in (made.trajectory, motion)]
+    assert distance(*dense) <= made.deviation + 1e-9 and made.deviation <= 0.02
+    light = Timing().motion_limits(robot)
+    assert light is not None and fitted(motion, robot.limits, light, timing).trajectory is motion
 
 
 def test_a_moving_start_over_a_limit_is_refused_by_joint_and_time(robot: Robot) -> None:
