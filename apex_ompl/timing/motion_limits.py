@@ -21,10 +21,10 @@ from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
 SHARE = 0.999  # share of a limit that motions are slowed down to, since torques are sampled
-SPACING = 0.016  # largest spacing of samples in time [s]
+SPACING = 0.02  # largest spacing of samples in time [s]
 MOST_SAMPLES = 2000  # of a long motion
 FINER = 8  # samples for each around the largest
-PEAKS, NEAR = 16, 0.98  # most of the largest samples, and share of the largest, around which more are taken
+PEAKS, NEAR = 4, 0.98  # most of the largest samples, and share of the largest, around which more are taken
 GRAVITY_SHARE = 0.995  # share of a limit above which gravity leaves nothing to move with
 PATH_SPACING = 0.2  # of the states of a path at which gravity is computed [rad]
 POINTS_PER_ROW = 5  # points of a grid along a curve from one at which torques are computed to the next
