@@ -7,6 +7,7 @@ of shape (K, dof) [rad, rad/s, rad/s^2]; the jerk is constant in between.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from apex_ompl.types import Array
 
 Knots = tuple[Array, Array, Array, Array]
 
+MOST_SPEED = 1e12  # squared, of curves without a limit [rad^2/s^2]
 TICK = jerk_profiles.TICK  # to which profiles' times are rounded [s]
 
 
@@ -81,7 +83,27 @@ def join_profiles(phases: Array, jerks: Array, starts: Integers, states: Array) 
     return times[:found].copy(), knots[:, :found].copy()
 
 
-def max_path_speeds(first: Array, second: Array, velocity: Array, acceleration: Array, step: float) -> Array:
+class PathRows(NamedTuple):
+    """Limits low <= slope u + bend x <= high along a curve q(s), with x = (ds/dt)^2 and u = d^2s/dt^2.
+
+    Attributes:
+        slope: At evenly spaced points of the curve, shape (n, rows).
+        bend: Shape (n, rows).
+        low: Not positive, shape (n, rows).
+        high: Not negative, shape (n, rows).
+        most: Bounds on x, shape (n,) [rad^2/s^2].
+    """
+
+    slope: Array
+    bend: Array
+    low: Array
+    high: Array
+    most: Array
+
+
+def max_path_speeds(
+    first: Array, second: Array, velocity: Array, acceleration: Array, step: float, more: PathRows | None = None
+) -> Array:
     """Return the largest squared speeds (ds/dt)^2 along a curve q(s), from rest to rest, shape (n,) [rad^2/s^2].
 
     Args:
@@ -90,10 +112,17 @@ def max_path_speeds(first: Array, second: Array, velocity: Array, acceleration: 
         velocity: Limits, shape (dof,) [rad/s].
         acceleration: Limits, shape (dof,) [rad/s^2].
         step: Spacing of the points along the curve [rad].
+        more: Further limits at the points.
     """
-    squared_speeds = np.empty(len(first))
-    time_parameterization.max_path_speeds(first, second, velocity, acceleration, step, squared_speeds)
-    return squared_speeds
+    high = np.tile(acceleration, (len(first), 1))
+    rows = PathRows(first, second, -high, high, np.full(len(first), MOST_SPEED))
+    if more is not None:
+        slope, bend = np.hstack([first, more.slope]), np.hstack([second, more.bend])
+        low, high = np.hstack([-high, more.low]), np.hstack([high, more.high])
+        rows = PathRows(slope, bend, low, high, np.minimum(more.most, MOST_SPEED))
+        velocity = np.append(velocity, np.full(more.slope.shape[1], np.inf))
+    time_parameterization.max_path_speeds(rows.slope, rows.bend, velocity, rows.low, rows.high, step, rows.most)
+    return rows.most
 
 
 def curve_duration(squared_speeds: Array, step: float) -> float:

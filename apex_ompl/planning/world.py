@@ -49,6 +49,9 @@ class ObstacleFields(TypedDict, total=False):
     half_space: HalfSpace | Mapping[str, Any]
     position: Sequence[float]
     orientation: Sequence[float]
+    mass: float | None
+    center_of_mass: Sequence[float] | None
+    inertia: Sequence[float] | None
     velocity: Sequence[float] | None
     trajectory: Sequence[Sequence[float]] | None
     appears: float

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from functools import cache
 from pathlib import Path
@@ -51,10 +52,11 @@ class Part(StrictModel):
 
 
 class Joint(StrictModel):
-    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3; no limit of jerk is ``.inf``].
+    """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3, Nm; no limit of jerk or effort is ``.inf``].
 
     Positions and velocity are by default those of the URDF. Limits wider than ``WIDEST``, by which URDFs say that a
-    joint has none, are narrowed to it.
+    joint has none, are narrowed to it. Efforts of URDFs are often placeholders, so that a joint whose effort the robot
+    file does not give has no limit of it.
     """
 
     home: float = 0.0
@@ -63,6 +65,7 @@ class Joint(StrictModel):
     velocity: PositiveFloat | None = None
     acceleration: PositiveFloat
     jerk: Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
+    effort: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] = math.inf
 
 
 class Hand(StrictModel):

@@ -109,6 +109,7 @@ class Robot:
         name: Name of the robot.
         joint_names: Planned joints in state order, the order of every state outside this module.
         limits: Limits in state order.
+        effort: Largest torques or forces that the robot file gives, shape (dof,) [Nm, N]; infinite where it gives none.
         home: A collision-free resting state, shape (dof,).
         groups: Group name -> indices into a state.
         hands: Hand name -> palm, grasp point and synergy.
@@ -124,6 +125,7 @@ class Robot:
     name: str
     joint_names: tuple[str, ...]
     limits: Limits
+    effort: Array
     home: Array
     groups: Mapping[str, NDArray[np.intp]]
     hands: Mapping[str, Hand]
@@ -160,6 +162,22 @@ class Robot:
     def link_names(self) -> tuple[str, ...]:
         """Names of all links."""
         return tuple(f.name for f in self.model.frames if f.type == pin.FrameType.BODY)
+
+    @property
+    def state_order(self) -> NDArray[np.intp]:
+        """Indices into a state in Pinocchio's order, shape (dof,)."""
+        return self._order
+
+    @property
+    def last_links(self) -> tuple[str, ...]:
+        """Last link on each joint that moves no other joint."""
+        model = self.model
+        ends = set(range(1, model.njoints)) - {*list(model.parents)[1:]}
+        return tuple(
+            {
+                f.parentJoint: f.name for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint in ends
+            }.values()
+        )
 
     def to_pinocchio(self, q: Array) -> Array:
         """Return a state, shape (dof,), or states, shape (N, dof), in Pinocchio's order, as a new array.
@@ -336,17 +354,18 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
             raise FileFormatError(str(path), "hands", hand.palm, "expected a link of the robot as palm")
     groups = {g: np.array([names.index(n) for n in members]) for g, members in config.groups.items()}
     limits = _limits(config, model, path)
+    effort = np.array([joint.effort for joint in config.joints.values()])
     home = np.array([joint.home for joint in config.joints.values()])
     outside = ~((home >= limits.lower) & (home <= limits.upper))
     if outside.any():
         name = names[int(np.argmax(outside))]
         field_name, value = f"joints.{name}.home", config.joints[name].home
         raise FileFormatError(str(path), field_name, value, "expected a value inside the limits")
-    for array in (home, *vars(limits).values(), *groups.values(), order):
+    for array in (effort, home, *vars(limits).values(), *groups.values(), order):
         array.flags.writeable = False
     return Robot(
-        name=config.name, joint_names=names, limits=limits, home=home, groups=groups, hands=config.hands, model=model,
-        geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
+        name=config.name, joint_names=names, limits=limits, effort=effort, home=home, groups=groups,
+        hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
         urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
     )  # fmt: skip
 

@@ -1,6 +1,6 @@
 """Solids of problem and robot files: shapes, poses, obstacles and held objects.
 
-Lengths are in meters, the world has z up, quaternions are ordered xyzw.
+Lengths are in meters, masses in kilograms, the world has z up, quaternions are ordered xyzw.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ MESH_SUFFIXES = (".stl", ".obj", ".ply", ".dae", ".glb", ".off")
 POINT_SUFFIXES = (".npy", ".ply", ".pcd")
 GRID_SUFFIXES = (".npz",)
 VOXEL_SUFFIXES = (".npz", ".bt")
-LARGEST = 1e4  # longer lengths are errors [m]
+LARGEST = 1e4  # longer lengths and larger masses are errors [m, kg]
+INERTIA_TOLERANCE = 1e-3  # relative error of moments of inertia, which files round
 
 
 def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
@@ -41,6 +42,7 @@ def _non_zero(v: tuple[float, float, float]) -> tuple[float, float, float]:
 Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Time = Annotated[float, Field(ge=0.0)]
 Size = Annotated[float, Field(gt=0.0, le=LARGEST)]
+Mass = Annotated[float, Field(gt=0.0, le=LARGEST)]
 Vector = tuple[Coordinate, Coordinate, Coordinate]
 Direction = Annotated[Vector, AfterValidator(_non_zero)]
 Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
@@ -159,7 +161,37 @@ MOTION = ("velocity", "trajectory", "appears")  # fields of the motion of an obs
 FILES = ("mesh", "points", "voxels", "distance_grid")  # shapes that are read from files
 
 
-class Obstacle(Body):
+class MassiveBody(Body):
+    """A solid that may have a mass; its shape, of uniform density, determines what is not given.
+
+    Attributes:
+        mass: Mass [kg]; without it the solid counts as weightless.
+        center_of_mass: Center of mass in the object's frame [m].
+        inertia: Inertia about the center of mass along the axes of the object's frame, in URDF's order ixx, ixy, ixz,
+            iyy, iyz, izz [kg m^2].
+    """
+
+    mass: Mass | None = None
+    center_of_mass: Vector | None = None
+    inertia: tuple[float, float, float, float, float, float] | None = None
+
+    @model_validator(mode="after")
+    def _possible_inertia(self) -> Self:
+        if self.mass is None and (self.center_of_mass is not None or self.inertia is not None):
+            raise ValueError(f"{self.name!r}: expected a mass beside center_of_mass and inertia")
+        if self.mass is not None and self.half_space is not None:
+            raise ValueError(f"{self.name!r}: expected no mass of a half_space")
+        if self.inertia is not None:
+            moments = np.linalg.eigvalsh(symmetric(self.inertia))
+            if moments[0] < 0.0 or moments[0] + moments[1] < moments[2] * (1.0 - INERTIA_TOLERANCE):
+                raise ValueError(
+                    f"{self.name!r}: expected an inertia whose principal moments are not negative, none of them larger "
+                    "than the sum of the others"
+                )
+        return self
+
+
+class Obstacle(MassiveBody):
     """A solid in the world frame, which may translate from time 0 on; see :mod:`apex_ompl.scene.scripts`.
 
     Attributes:
@@ -210,7 +242,7 @@ class ContactFace(StrictModel):
     axis: Direction = (0.0, 0.0, 1.0)
 
 
-class AttachedObject(Body):
+class AttachedObject(MassiveBody):
     """A held solid, with its pose in the frame of the link that holds it.
 
     ``touch_links`` are the links that it may touch; None means all links of the hand that holds it.
@@ -259,6 +291,12 @@ def pose_matrix(position: ArrayLike, orientation: ArrayLike) -> Array:
     ]
     pose[:3, 3] = position
     return pose
+
+
+def symmetric(entries: ArrayLike) -> Array:
+    """Return the symmetric matrix with entries xx, xy, xz, yy, yz, zz, shape (3, 3)."""
+    xx, xy, xz, yy, yz, zz = np.asarray(entries, float)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def pose_fields(pose: Array) -> dict[str, tuple[float, ...]]:

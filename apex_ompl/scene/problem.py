@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
 
 from apex_ompl.errors import FileFormatError, nearest_name
-from apex_ompl.scene.bodies import AttachedObject, Name, Obstacle, Quaternion, Vector, located
+from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
@@ -160,6 +160,8 @@ class Problem(StrictModel):
         robot: Name of a robot that ships with the package, or path of a robot file.
         scene: Obstacles in the world frame, besides the robot's own fixtures.
         attached: Held objects.
+        payload: Name of a hand or a link -> mass that is held there beside the held objects [kg], at the grasp point of
+            a hand and at the origin of a link.
         allowed: Pairs of bodies that may touch and overlap: names of links, held objects, obstacles and fixtures.
         start: Joint name -> value of the start state.
         goal: The goal.
@@ -170,6 +172,7 @@ class Problem(StrictModel):
     robot: str
     scene: tuple[Obstacle, ...] = ()
     attached: tuple[AttachedObject, ...] = ()
+    payload: dict[Name, Mass] = {}
     allowed: tuple[tuple[str, str], ...] = ()
     start: JointValues
     goal: Goal

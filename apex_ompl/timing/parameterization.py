@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -14,30 +15,45 @@ from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
 from apex_ompl.kernel.products import cholesky, solve
 from apex_ompl.kernel.timing import arc_lengths, cubic_rates, max_distance, max_path_speeds
 from apex_ompl.paths.path import Path
-from apex_ompl.robot.model import Limits
+from apex_ompl.robot.model import Limits, Robot
+from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.timing import ruckig_method, spline_method
 from apex_ompl.timing.curve import SAME_STATE, Polyline, deviation_bound
+from apex_ompl.timing.motion_limits import MotionLimits
 from apex_ompl.timing.ruckig_method import Profiles, from_moving_start, joined
 from apex_ompl.timing.trajectory import Extremes, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
-from apex_ompl.util.validation import check_array, check_name, check_number, check_positive, check_states, finite_array
+from apex_ompl.util.validation import (
+    check_array,
+    check_flag,
+    check_name,
+    check_number,
+    check_positive,
+    check_states,
+    finite_array,
+)
 
 METHODS = MappingProxyType({"ruckig": ruckig_method.blended, "spline": spline_method.blended})
 """Methods by name.
 
-Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad] and a function that
-returns True to end the search; it returns the trajectory and a bound on its distance from the polyline [rad], or None.
+Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad], a function that
+returns True to end the search, and limits of torques and tool speeds or None; it returns the trajectory and a bound on
+its distance from the polyline [rad], or None.
 """
 DEFAULT_METHOD = "ruckig"
 
 SHORTEST_DURATION = 1e-3  # of a motion between states that count as the same [s]
 FALLBACK = "spline"  # where the given method has no blended motion
+SAME_DURATION = 1.02  # ratio of durations up to which a motion is not timed again for limits of torques and tool speeds
+SLOWED_AGAIN = 3  # times that a motion is slowed down to limits, which are sampled anew each time
+MOVING_START_SHARES = (1.0, 0.5, 0.25)  # shares of the acceleration limits from a moving start, while a torque is over
+FIT_SPACING = 0.01  # of states of a motion whose path is timed anew [s]
 BLENDS = 8  # deviations that are tried, each half of the one before, until the motion stops at corners
 LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rounding [rad]
 LIMITS = ("velocity", "acceleration", "jerk")
 RANGES = {
-    **{f"{limit}_scale": (1e-3, 1.0) for limit in LIMITS},
+    **{f"{limit}_scale": (1e-3, 1.0) for limit in (*LIMITS, "torque")},
     "deviation": (1e-3, 10.0), "minimum_duration": (0.0, 3600.0),
 }  # fmt: skip
 
@@ -58,6 +74,15 @@ class Timing:
         max_velocity: Reduced velocity limits by joint name [rad/s], to which the scale is applied too.
         max_acceleration: Reduced acceleration limits by joint name [rad/s^2].
         max_jerk: Reduced jerk limits by joint name [rad/s^3].
+        torque_limits: Whether joint torques keep the limits that the robot file gives (``effort``), by inverse
+            dynamics with the masses of held objects.
+        torque_scale: Share of the torque limits.
+        max_torque: Reduced torque limits by joint name, or limits of joints that have none [Nm, N].
+        max_tool_speed: Largest speed of every tool, or by name of a hand, held object or link [m/s]; none by default.
+            Tools are the hands, at their grasp points, and the held objects, and the last links of a robot without
+            hands.
+        payload: Mass in each hand, or at each link, by name, beside the held objects [kg]; it goes before the problem's
+            own.
         start_velocity: Velocity at the start, one number a joint, or none for rest [rad/s].
         start_acceleration: Acceleration at the start, one number a joint, or none for zero [rad/s^2].
     """
@@ -71,6 +96,11 @@ class Timing:
     max_velocity: Mapping[str, float] = field(default_factory=dict)
     max_acceleration: Mapping[str, float] = field(default_factory=dict)
     max_jerk: Mapping[str, float] = field(default_factory=dict)
+    torque_limits: bool = True
+    torque_scale: float = 1.0
+    max_torque: Mapping[str, float] = field(default_factory=dict)
+    max_tool_speed: float | Mapping[str, float] | None = None
+    payload: Mapping[str, float] = field(default_factory=dict)
     start_velocity: Sequence[float] = ()
     start_acceleration: Sequence[float] = ()
 
@@ -86,9 +116,15 @@ class Timing:
         check_name(self.method, "timing method", METHODS)
         for name, (low, high) in RANGES.items():
             check_number(getattr(self, name), name, low, high)
-        for limit in LIMITS:
-            for joint, value in _by_joint(self, limit).items():
-                check_positive(value, f"max_{limit}.{joint}")
+        check_flag(self.torque_limits, "torque_limits")
+        for name in (*(f"max_{limit}" for limit in (*LIMITS, "torque")), "payload"):
+            for key, value in _by_name(self, name).items():
+                check_positive(value, f"{name}.{key}")
+        if self.max_tool_speed is not None and not isinstance(self.max_tool_speed, Mapping):
+            check_positive(self.max_tool_speed, "max_tool_speed", "a positive number, or numbers by name")
+        else:
+            for tool, value in (self.max_tool_speed or {}).items():
+                check_positive(value, f"max_tool_speed.{tool}")
         for name in ("start_velocity", "start_acceleration"):
             object.__setattr__(
                 self, name, tuple(np.atleast_1d(finite_array(getattr(self, name), name)).ravel().tolist())
@@ -113,7 +149,7 @@ class Timing:
         scaled = {}
         for limit in LIMITS:
             values = np.array(getattr(limits, limit))
-            for joint, value in _by_joint(self, limit).items():
+            for joint, value in _by_name(self, f"max_{limit}").items():
                 check_name(joint, "joint", joint_names)
                 k = list(joint_names).index(joint)
                 if value > values[k]:
@@ -121,6 +157,33 @@ class Timing:
                 values[k] = value
             scaled[limit] = values * getattr(self, f"{limit}_scale")
         return replace(limits, **scaled)
+
+    def motion_limits(
+        self, robot: Robot, held: Sequence[AttachedObject] = (), payload: Mapping[str, float] | None = None
+    ) -> MotionLimits | None:
+        """Return the limits of torques and tool speeds, or None where there are none.
+
+        Args:
+            robot: The robot.
+            held: Held objects; those without a mass count as weightless.
+            payload: Mass in each hand or at each link by name, beside them [kg], such as that of a problem.
+
+        Raises:
+            UnknownNameError: There is no such joint, hand, held object or link.
+            ParameterError: A limit is higher than the robot's.
+            RobotError: Torques are limited, and no link of the robot has a mass.
+        """
+        torque = robot.effort.copy() if self.torque_limits else np.full(robot.dof, np.inf)
+        for joint, value in _by_name(self, "max_torque").items():
+            check_name(joint, "joint", robot.joint_names)
+            k = robot.joint_names.index(joint)
+            if value > torque[k]:
+                raise ParameterError(f"max_torque.{joint}", value, f"at most {torque[k]:g}, the robot's limit")
+            torque[k] = value
+        torque *= self.torque_scale
+        if not np.isfinite(torque).any() and not self.max_tool_speed:
+            return None
+        return MotionLimits(robot, torque, self.max_tool_speed, held, {**(payload or {}), **self.payload})
 
     def start(self, limits: Limits) -> tuple[Array, Array] | None:
         """Return velocity and acceleration at the start, each of shape (dof,), or None for rest.
@@ -168,6 +231,7 @@ class TimedPath:
 def time_path(
     path: Path | ArrayLike, limits: Limits, joint_names: Sequence[str], timing: Timing | None = None,
     fault: Callable[[Trajectory], str] = lambda trajectory: "", *, stop: Callable[[], bool] = lambda: False,
+    motion_limits: MotionLimits | None = None,
 ) -> TimedPath:  # fmt: skip
     """Time a path.
 
@@ -177,6 +241,9 @@ def time_path(
     Ruckig has no motion within the deviation and the position limits, which it does not take into account, the spline
     method is used.
 
+    A motion that exceeds ``motion_limits`` is slowed down as a whole, or timed again with these limits in the
+    reachability analysis, by either method, whichever is faster.
+
     Args:
         path: Path, or states of shape (N, dof). The motion follows the straight lines between its states, also where
             it has a spline, because these are what passed the full check.
@@ -185,6 +252,8 @@ def time_path(
         timing: How the path is timed.
         fault: Returns the reason for which a motion is invalid, or an empty text.
         stop: Called often; True ends the search.
+        motion_limits: Limits of torques and tool speeds, see :meth:`Timing.motion_limits`; those that ``timing`` gives
+            need the robot, and count only if they are given here.
 
     Raises:
         TimingStoppedError: ``stop`` returned True before there was a valid motion.
@@ -201,10 +270,16 @@ def time_path(
     scaled = timing.limits(limits, joint_names)
     _check(states, limits, joint_names)
     start = timing.start(scaled)
-    reason, line = "", Polyline.through(states)
-    for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop):
+    line, reason = Polyline.through(states), "" if motion_limits is None else motion_limits.gravity_fault(states)
+    if reason:
+        raise TimingError(reason)
+    for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop=stop, more=motion_limits):
         rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration))
-        for candidate in [rest] if start is None else _from_moving_start(start, rest, line, scaled, timing, stop=stop):
+        for candidate in (
+            [rest]
+            if start is None
+            else _from_moving_start(start, rest, line, scaled, timing, stop=stop, more=motion_limits)
+        ):
             reason = fault(candidate.trajectory)
             if not reason:
                 return candidate
@@ -215,10 +290,41 @@ def time_path(
     raise TimingError(reason or "no motion from the velocity at the start stays within the limits")
 
 
-def _by_joint(timing: Timing, limit: str) -> Mapping[str, float]:
-    given = getattr(timing, f"max_{limit}")
+def fitted(
+    motion: Trajectory, limits: Limits, more: MotionLimits, timing: Timing | None = None,
+    *, stop: Callable[[], bool] = lambda: False,
+) -> TimedPath:  # fmt: skip
+    """Return a motion from rest to rest along the path of another one that keeps limits of torques and tool speeds.
+
+    It is the motion itself where it keeps them, else the faster of the motion slowed down as a whole and of a motion
+    timed along its path, by the method of ``timing``, with these limits in the reachability analysis. The second
+    deviates from the path, so that it must be checked for collisions anew.
+
+    Args:
+        motion: Motion from rest to rest within the limits of its joints.
+        limits: The scaled limits of the joints.
+        more: Limits of torques and tool speeds.
+        timing: Method and allowed deviation.
+        stop: Called often; where it returns True, the slowed motion is returned.
+
+    Raises:
+        TimingError: Gravity alone exceeds a limit.
+    """
+    timing = timing or Timing()
+    slowed, factor = _slowed(TimedPath(motion, 0.0, timing.method, "slowed"), more)
+    if factor <= SAME_DURATION:
+        return slowed
+    line = Polyline.through(motion(np.linspace(0.0, motion.duration, math.ceil(motion.duration / FIT_SPACING) + 1)))
+    blended = _blended(
+        line, limits, motion.joint_names, timing.method, timing.deviation, stop=stop, more=more, plain=False
+    )
+    return slowed if blended is None or blended.trajectory.duration >= slowed.trajectory.duration else blended
+
+
+def _by_name(timing: Timing, field: str) -> Mapping[str, float]:
+    given = getattr(timing, field)
     if not isinstance(given, Mapping):
-        raise ParameterError(f"max_{limit}", given, "values by joint name")
+        raise ParameterError(field, given, "masses by hand or link" if field == "payload" else "values by joint name")
     return given
 
 
@@ -233,8 +339,9 @@ def _check(states: Array, limits: Limits, joint_names: Sequence[str]) -> None:
 
 
 def _from_rest(
-    line: Polyline, limits: Limits, joint_names: tuple[str, ...], timing: Timing, stop: Callable[[], bool]
-) -> Iterator[TimedPath]:
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], timing: Timing,
+    *, stop: Callable[[], bool], more: MotionLimits | None,
+) -> Iterator[TimedPath]:  # fmt: skip
     """Yield motions from rest to rest, each closer to the path than the one before, until ``stop`` holds."""
     if stop():
         return
@@ -242,23 +349,68 @@ def _from_rest(
         yield TimedPath(_at_rest(line.states, joint_names), 0.0, "ruckig", "line")
         return
     straight = len(line.corners().states) == 2
-    if not straight:
-        for k in range(BLENDS):
-            for method in dict.fromkeys((timing.method, FALLBACK)):
-                motion = METHODS[method](line, limits, joint_names, timing.deviation / 2**k, stop)
-                if stop():
-                    return
-                if motion is not None:
-                    yield TimedPath(*motion, method, "blended")
-                    break
+    for k in range(0 if straight else BLENDS):
+        blended = _blended(line, limits, joint_names, timing.method, timing.deviation / 2**k, stop=stop, more=more)
+        if stop():
+            return
+        if blended is not None:
+            yield blended
     motion = ruckig_method.stops(line, limits, joint_names, stop)
-    if motion is not None:
-        yield TimedPath(*motion, "ruckig", "line" if straight else "stops")
+    if motion is None:
+        return
+    stopping, factor = _slowed(TimedPath(*motion, "ruckig", "line" if straight else "stops"), more)
+    if straight and factor > SAME_DURATION:
+        blended = _blended(line, limits, joint_names, "spline", timing.deviation, stop=stop, more=more)
+        if blended is not None and blended.trajectory.duration < stopping.trajectory.duration:
+            yield replace(blended, form="line")
+    yield stopping
+
+
+def _blended(
+    line: Polyline, limits: Limits, joint_names: tuple[str, ...], method: str, deviation: float,
+    *, stop: Callable[[], bool], more: MotionLimits | None, plain: bool = True,
+) -> TimedPath | None:  # fmt: skip
+    """Return the blended motion of a method, or of ``FALLBACK`` where it has none; the fastest that keeps ``more``.
+
+    A motion that need not be slowed down is returned at once. With ``plain`` one that is made without ``more`` is tried
+    first.
+    """
+    fastest: TimedPath | None = None
+    for way in dict.fromkeys((method, FALLBACK)):
+        for rows in dict.fromkeys((None, more) if plain else (more,)):
+            motion = METHODS[way](line, limits, joint_names, deviation, stop, more=rows)
+            if motion is None:
+                break
+            timed, factor = _slowed(TimedPath(*motion, way, "blended"), more)
+            if fastest is None or timed.trajectory.duration * SAME_DURATION < fastest.trajectory.duration:
+                fastest = timed
+            if factor <= SAME_DURATION:
+                return fastest
+    return fastest
+
+
+def _slowed(timed: TimedPath, more: MotionLimits | None) -> tuple[TimedPath, float]:
+    """Return a motion slowed down to the limits of torques and tool speeds, and the factor.
+
+    Raises:
+        TimingError: Gravity alone exceeds a limit.
+    """
+    if more is None:
+        return timed, 1.0
+    motion = timed.trajectory
+    for _ in range(SLOWED_AGAIN):
+        factor = more.stretch(motion)
+        if not np.isfinite(factor):
+            raise TimingError("gravity alone exceeds a limit of torque along the motion")
+        if factor == 1.0:
+            break
+        motion = motion.slower(factor)
+    return replace(timed, trajectory=motion), motion.duration / timed.trajectory.duration
 
 
 def _from_moving_start(
     start: tuple[Array, Array], timed: TimedPath, line: Polyline, limits: Limits, timing: Timing,
-    *, stop: Callable[[], bool],
+    *, stop: Callable[[], bool], more: MotionLimits | None,
 ) -> list[TimedPath]:  # fmt: skip
     """Return motions from a moving start: those within the deviation, fastest first, then the others, nearest first.
 
@@ -269,15 +421,28 @@ def _from_moving_start(
         limits: The scaled limits.
         timing: How the path is timed.
         stop: Called often; True ends the search.
+        more: Limits of torques and tool speeds.
+
+    Raises:
+        TimingError: All of them exceed a limit of torque or tool speed.
     """
-    candidates = []
-    for motion, join_time in from_moving_start(*start, timed.trajectory, limits, timing.minimum_duration):
-        if stop():
+    candidates, reason = [], ""
+    for share in MOVING_START_SHARES if more is not None else (1.0,):
+        within = replace(limits, acceleration=share * limits.acceleration)
+        for motion, join_time in from_moving_start(*start, timed.trajectory, within, timing.minimum_duration):
+            if stop():
+                break
+            reason = "" if more is None else more.fault(motion)
+            if reason:
+                continue
+            arc_at = np.array([0.0, join_time]), np.zeros(2)  # it may be near any point of the path
+            head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation, stop=stop)
+            deviation, form = max(head_deviation, timed.deviation), f"moving start, {timed.form}"
+            candidates.append(replace(timed, trajectory=motion, deviation=deviation, form=form))
+        if candidates or not reason:
             break
-        arc_at = np.array([0.0, join_time]), np.zeros(2)  # it may be near any point of the path
-        head_deviation = deviation_bound(motion, line, arc_at, line.length, timing.deviation, stop=stop)
-        deviation = max(head_deviation, timed.deviation)
-        candidates.append(replace(timed, trajectory=motion, deviation=deviation, form=f"moving start, {timed.form}"))
+    if reason and not candidates and not stop():
+        raise TimingError(reason)
     return sorted(candidates, key=lambda made: (max(made.deviation, timing.deviation), made.trajectory.duration))
 
 

@@ -13,6 +13,7 @@ from apex_ompl.errors import TimingError
 from apex_ompl.kernel.timing import TICK, join_profiles
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.curve import Polyline, deviation_bound
+from apex_ompl.timing.motion_limits import MotionLimits
 from apex_ompl.timing.spline_method import blend
 from apex_ompl.timing.trajectory import ROUNDING, Trajectory, concatenate
 from apex_ompl.types import Array
@@ -107,7 +108,7 @@ def joined(profiles: Profiles, states: Array, joint_names: tuple[str, ...]) -> T
 
 def blended(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool] = lambda: False, *, more: MotionLimits | None = None,
 ) -> tuple[Trajectory, float] | None:  # fmt: skip
     """Return Ruckig's motion along a polyline, its corners rounded.
 
@@ -123,13 +124,14 @@ def blended(
         joint_names: Names of the joints, in the order of the columns.
         deviation: Largest distance of the motion from the polyline [rad].
         stop: Called before every state-to-state problem; True ends the search.
+        more: Limits of torques and tool speeds, see :func:`apex_ompl.timing.spline_method.blend`.
 
     Returns:
         The motion and a bound on its distance from the polyline [rad], or None where none keeps ``deviation``, or when
         ``stop`` returned True.
     """
     room = {name: LIMITS_SHARE * getattr(limits, name) for name in ("velocity", "acceleration")}
-    guide = blend(line, replace(limits, **room), joint_names, deviation, stop)
+    guide = blend(line, replace(limits, **room), joint_names, deviation, stop, more=more)
     if guide is None:
         return None
     knot_times, arc = guide.arc_at

@@ -12,6 +12,7 @@ import numpy as np
 from apex_ompl.kernel.timing import arc_lengths, curve_duration, max_distance, max_path_speeds
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.curve import Curve, Polyline, deviation_bound
+from apex_ompl.timing.motion_limits import MotionLimits
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -43,16 +44,16 @@ class Blend(NamedTuple):
 
 def blended(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool] = lambda: False, *, more: MotionLimits | None = None,
 ) -> tuple[Trajectory, float] | None:  # fmt: skip
     """Return the motion of :func:`blend` and the bound on its distance from the polyline [rad], or None."""
-    found = blend(line, limits, joint_names, deviation, stop)
+    found = blend(line, limits, joint_names, deviation, stop, more=more)
     return None if found is None else (found.trajectory, found.deviation)
 
 
 def blend(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Callable[[], bool] = lambda: False, *, more: MotionLimits | None = None,
 ) -> Blend | None:  # fmt: skip
     """Return the fastest motion along a curve that rounds the corners of a polyline.
 
@@ -70,6 +71,7 @@ def blend(
         joint_names: Names of the joints, in the order of the columns.
         deviation: Largest distance of the motion from the polyline [rad].
         stop: Called before every knot spacing; True ends the search.
+        more: Limits of torques and tool speeds, which count in step 2; the spline in time may exceed them a little.
 
     Returns:
         The motion, or None where none keeps ``deviation``, or when ``stop`` returned True.
@@ -82,6 +84,7 @@ def blend(
     grid = np.linspace(0.0, line.length, len(first))
     if max_distance(curve.points(grid), grid, line.states, line.arc, window) > deviation:
         return None
+    rows = None if more is None else more.rows(curve.points(grid), first, second)
     tried: dict[int, tuple[float, Array, Array]] = {}  # least knot spacing [s], control points, their arc lengths
 
     def duration_with(index: int) -> float:
@@ -89,7 +92,7 @@ def blend(
         if index not in tried:
             spacing = KNOT_SPACINGS[index]
             acceleration = np.minimum(limits.acceleration, limits.jerk * spacing)
-            squared_speeds = max_path_speeds(first, second, limits.velocity, acceleration, step)
+            squared_speeds = max_path_speeds(first, second, limits.velocity, acceleration, step, rows)
             duration = curve_duration(squared_speeds, step)
             count = max(1, int(duration / spacing))
             arc = arc_lengths(squared_speeds, step, duration / count, count + 1)
@@ -97,7 +100,8 @@ def blend(
             points = curve.points(arc)
             points[0], points[-1] = line.states[0], line.states[-1]
             control = np.concatenate([points[:1], points[:1], points, points[-1:], points[-1:]])
-            tried[index] = (least_knot_spacing(control, limits), control, arc)
+            least = least_knot_spacing(control, limits)
+            tried[index] = (least if rows is None else max(least, duration / count), control, arc)
         least, control, _ = tried[index]
         return least * (len(control) - 3) if least > 0.0 else math.inf  # 0 at the ends of a closed path
 

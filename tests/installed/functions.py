@@ -94,6 +94,7 @@ def _use_planner() -> None:
 
     robot = apex_ompl.load_robot("dual_panda_softhand")
     home = robot.home
+    assert len(robot.last_links) == 12
     with apex_ompl.MotionPlanner(robot) as planner:
         world = planner.world
         seen = apex_ompl.points_from_depth(np.full((8, 8), 2.0), (50.0, 50.0, 4.0, 4.0), np.eye(4))

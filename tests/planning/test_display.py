@@ -30,6 +30,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.robot.config import RobotConfig
 from apex_ompl.robot.model import _spelled
 from apex_ompl.scene import AttachedObject, Goal
+from apex_ompl.scene.bodies import Body
 from apex_ompl.training import Paths
 from apex_ompl.util.display import WIDTH, Summary, fields_line, html_table, one_line
 from apex_ompl.util.schema import StrictModel
@@ -210,11 +211,11 @@ def test_records_show_the_fields_that_were_given() -> None:
 
 
 def test_digests_of_robots_do_not_depend_on_how_records_show_themselves() -> None:
-    ball = Obstacle(name="a", sphere={"radius": 0.1})
+    ball = Body(name="a", sphere={"radius": 0.1})
     assert _spelled((("x",), [(1, 2)], (ball,))) == (
-        "(('x',), [(1, 2)], (Obstacle(name='a', box=None, sphere=Sphere(radius=0.1), cylinder=None, capsule=None, "
+        "(('x',), [(1, 2)], (Body(name='a', box=None, sphere=Sphere(radius=0.1), cylinder=None, capsule=None, "
         "mesh=None, points=None, voxels=None, distance_grid=None, half_space=None, position=(0.0, 0.0, 0.0), "
-        "orientation=(0.0, 0.0, 0.0, 1.0), velocity=None, trajectory=None, appears=0.0),))"
+        "orientation=(0.0, 0.0, 0.0, 1.0)),))"
     )
 
 

@@ -296,3 +296,44 @@ def test_documents_without_content_do_not_count() -> None:
 def test_values_on_a_command_line_are_read_as_in_files() -> None:
     assert key_value("rate=1e-3") == ("rate", 1e-3)
     assert key_value("name=on") == ("name", True) and key_value("name='1'") == ("name", "1")
+
+
+def test_masses_of_objects_and_payloads_are_read_and_written(tmp_path: Path) -> None:
+    text = FILE.replace("length: 0.11},", "length: 0.11}, mass: 0.4, center_of_mass: [0, 0, 0.01],")
+    text = text.replace("attached:", "payload: {right_hand: 2}\nattached:")
+    problem = load_text(tmp_path, text)
+    assert problem.attached[0].mass == 0.4 and problem.attached[0].center_of_mass == (0.0, 0.0, 0.01)
+    assert problem.payload == {"right_hand": 2.0}
+    again = Problem.parse(problem.as_dict(), "again")
+    assert again.attached == problem.attached and again.payload == problem.payload
+    assert not {"payload", "mass", "inertia"} & {*load_text(tmp_path, FILE).to_yaml().split()}
+
+
+@pytest.mark.parametrize(
+    ("field", "expected"),
+    [
+        ("mass: 0", "attached.0.mass: input should be greater than 0, got 0"),
+        ("mass: -1.5", "attached.0.mass: input should be greater than 0, got -1.5"),
+        ("mass: .nan", "attached.0.mass: input should be"),
+        ("mass: .inf", "attached.0.mass: input should be"),
+        ("center_of_mass: [0, 0, 0]", "expected a mass beside center_of_mass and inertia"),
+        ("mass: 1, inertia: [1, 0, 0, 1, 0]", "attached.0.inertia.5: required key is missing"),
+        ("mass: 1, inertia: [1, 0, 0, 1, 0, 2.1]", "'cup': expected an inertia whose principal moments"),
+        ("mass: 1, inertia: [1, 2, 0, 1, 0, 1]", "'cup': expected an inertia whose principal moments"),
+        ("mass: 1, inertia: [.nan, 0, 0, 1, 0, 1]", "attached.0.inertia.0: input should be"),
+    ],
+)
+def test_faulty_masses_are_named(tmp_path: Path, field: str, expected: str) -> None:
+    with pytest.raises(FileFormatError, match=expected):
+        load_text(tmp_path, FILE.replace("length: 0.11},", f"length: 0.11}}, {field},"))
+
+
+@pytest.mark.parametrize("mass", ["0", "-1", ".nan", "heavy"])
+def test_faulty_payloads_are_named(tmp_path: Path, mass: str) -> None:
+    with pytest.raises(FileFormatError, match=r"payload.right_hand: (input should be|expected a number)"):
+        load_text(tmp_path, f"{FILE}payload: {{right_hand: {mass}}}\n")
+
+
+def test_half_spaces_have_no_mass() -> None:
+    with pytest.raises(FileFormatError, match="'floor': expected no mass of a half_space"):
+        Obstacle(name="floor", half_space={"normal": (0, 0, 1)}, mass=1.0)

@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import linprog
 from support import distance
 
-from apex_ompl.kernel.compiled.timing.time_parameterization import max_distance, max_path_speeds, sample_times
+from apex_ompl.kernel.compiled.timing.time_parameterization import max_distance, sample_times
+from apex_ompl.kernel.timing import PathRows, max_path_speeds
 from apex_ompl.timing.curve import Curve, Polyline
 
 VELOCITY, ACCELERATION = np.array([2.0, 2.5, 1.5]), np.array([10.0, 15.0, 8.0])
@@ -21,8 +22,7 @@ def test_path_speeds_are_those_of_a_linear_program(seed: int) -> None:
     curve = Curve.along(Polyline.through(path), 0.5)
     first, second = curve.derivatives(12)
     n, step = len(first), curve.spacing / 12
-    x = np.empty(n)
-    max_path_speeds(first, second, VELOCITY, ACCELERATION, step, x)
+    x = max_path_speeds(first, second, VELOCITY, ACCELERATION, step)
     rows, bounds = [], []
     for i in range(n - 1):  # |q' u + q'' x| <= a with u = (x[i + 1] - x[i]) / (2 step)
         for j in range(3):
@@ -39,6 +39,39 @@ def test_path_speeds_are_those_of_a_linear_program(seed: int) -> None:
     assert sample_times(x, step, 0.0, np.empty(0)) == pytest.approx(duration) and duration < 1.01 * least
     if seed == 2:  # without such a place
         np.testing.assert_allclose(x, found.x, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_path_speeds_keep_further_limits(seed: int) -> None:
+    """Limits that are not symmetric, as those of torques under gravity, and bounds on the speed."""
+    rng = np.random.default_rng(seed)
+    curve = Curve.along(Polyline.through(np.cumsum(rng.normal(0.0, 0.3, (8, 3)), axis=0)), 0.5)
+    first, second = curve.derivatives(12)
+    n, step = len(first), curve.spacing / 12
+    mix, offset = rng.normal(0.0, 1.0, (3, 2)), 0.5 * np.sin(np.linspace(0.0, 9.0, n))[:, None]
+    most = rng.uniform(1.0, 3.0, n)
+    rows = PathRows(first @ mix, second @ mix, np.tile(-5.0 - offset, 2), np.tile(5.0 - offset, 2), most)
+    x = max_path_speeds(first, second, VELOCITY, ACCELERATION, step, rows)
+    assert (x <= most).all() and x[1:-1].min() > 0.0
+    u = np.diff(x) / (2.0 * step)
+    value = rows.slope[:-1] * u[:, None] + rows.bend[:-1] * x[:-1, None]
+    assert (value >= rows.low[:-1] - 1e-9).all() and (value <= rows.high[:-1] + 1e-9).all()
+    matrix, bounds = [], []
+    for slope, bend, low, high in (
+        (first, second, np.tile(-ACCELERATION, (n, 1)), np.tile(ACCELERATION, (n, 1))), rows[:-1]
+    ):  # fmt: skip
+        for i in range(n - 1):
+            for j in range(slope.shape[1]):
+                row = np.zeros(n)
+                row[i], row[i + 1] = bend[i, j] - slope[i, j] / (2 * step), slope[i, j] / (2 * step)
+                matrix += [row, -row]
+                bounds += [high[i, j], -low[i, j]]
+    cap = np.minimum(most, np.min((VELOCITY / np.maximum(np.abs(first), 1e-12)) ** 2, axis=1))
+    cap[[0, -1]] = 0.0
+    found = linprog(-np.ones(n), np.array(matrix), np.array(bounds), bounds=np.stack([np.zeros(n), cap], 1))
+    assert found.success
+    duration, least = (np.sum(2.0 * step / (np.sqrt(y[1:]) + np.sqrt(y[:-1]))) for y in (x, np.maximum(found.x, 0.0)))
+    assert duration < 1.01 * least
 
 
 def test_places_at_even_times_follow_the_speeds() -> None:

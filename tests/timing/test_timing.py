@@ -12,7 +12,7 @@ from support import distance
 from timings import LIMITS, NAMES, RATE, keeps_limits, paths, timed
 
 from apex_ompl.errors import ParameterError, TimingError, UnknownNameError
-from apex_ompl.kernel.compiled.timing.time_parameterization import max_path_speeds, sample_times
+from apex_ompl.kernel.timing import curve_duration, max_path_speeds
 from apex_ompl.robot import Limits
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.curve import Curve, Polyline
@@ -147,10 +147,8 @@ def test_a_gentle_curve_takes_little_more_than_the_least_time() -> None:
     path = np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), np.zeros(256)], 1)
     stiff = Limits(np.full(3, -3.0), np.full(3, 3.0), np.full(3, 2.0), np.full(3, 10.0), np.full(3, 1e6))
     first, second = Curve.along(Polyline.through(path), 0.01).derivatives(10)
-    x = np.empty(len(first))
     step = Polyline.through(path).length / (len(first) - 1)
-    max_path_speeds(first, second, stiff.velocity, stiff.acceleration, step, x)
-    least = sample_times(x, step, 0.0, np.empty(0))
+    least = curve_duration(max_path_speeds(first, second, stiff.velocity, stiff.acceleration, step), step)
     made = timed(path, limits=stiff)
     assert 0.995 * least < made.trajectory.duration < 1.05 * least
 

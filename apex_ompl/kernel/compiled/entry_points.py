@@ -101,7 +101,7 @@ PLANS = Group(
             "timing.cubic_pieces.cubic_rates": (KNOTS + ", f8[:, ::1]", 1),
             "timing.time_parameterization.max_distance": ("f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8", 1),
             "timing.time_parameterization.max_path_speeds": (
-                "f8[:, ::1], f8[:, ::1], f8[::1], f8[::1], f8, f8[::1]",
+                "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], f8, f8[::1]",
                 1,
             ),
             "timing.time_parameterization.sample_times": ("f8[::1], f8, f8, f8[::1]", 1),

@@ -2,11 +2,13 @@
 
 Along a curve q(s), with x = (ds/dt)^2 and u = d^2s/dt^2, the limits are
 
-    |q'| sqrt(x) <= v   and   |q' u + q'' x| <= a,
+    |q'| sqrt(x) <= v   and   low <= q' u + q'' x <= high,
 
-the second linear in x and u. On a grid, x[i + 1] = x[i] + 2 step u[i]. A backward pass finds at each point the largest
-x from which the next point's set can be reached, by Newton's method, and a forward pass takes the largest u that stays
-inside these sets. From rest every set holds 0, so that the sets are intervals [0, x].
+the second linear in x and u. Those of an acceleration are -a and a. A torque has the same form, with M q' and
+M q'' + C q' in place of q' and q'', and limits less the torque of gravity. On a grid, x[i + 1] = x[i] + 2 step u[i]. A
+backward pass finds at each point the largest x from which the next point's set can be reached, by Newton's method, and
+a forward pass takes the largest u that stays inside these sets. From rest every set holds 0, so that the sets are
+intervals [0, x].
 
 How far a curve deviates from the path that it stands for is measured by the distances of its points from a polyline.
 """
@@ -24,55 +26,60 @@ STILL = 1e-10  # |q'| below which a joint does not move along the curve
 
 @inlined
 def _u_range(
-    first: Floats, second: Floats, limit: Floats, i: int, x: float, after: float, step: float
+    first: Floats, second: Floats, low: Floats, high: Floats, i: int, x: float, after: float, step: float
 ) -> tuple[float, float, float]:
     """Return the least and largest u at point ``i``, and the rate of the least minus the largest by x.
 
-    With |q' u + q'' x| <= a, and with an x at the next point that is at least 0 and at most ``after``.
+    With low <= q' u + q'' x <= high, and with an x at the next point that is at least 0 and at most ``after``.
     """
     by_next = -0.5 / step
-    low, low_rate, high, high_rate = by_next * x, by_next, by_next * (x - after), by_next
-    for j in range(limit.shape[0]):
+    least, least_rate, most, most_rate = by_next * x, by_next, by_next * (x - after), by_next
+    for j in range(first.shape[1]):
         slope = first[i, j]
         if abs(slope) < STILL:
             continue
-        rate, reach = -second[i, j] / slope, limit[j] / abs(slope)
-        if rate * x - reach > low:
-            low, low_rate = rate * x - reach, rate
-        if rate * x + reach < high:
-            high, high_rate = rate * x + reach, rate
-    return low, high, low_rate - high_rate
+        rate = -second[i, j] / slope
+        below = rate * x + (low[i, j] if slope > 0.0 else high[i, j]) / slope
+        above = rate * x + (high[i, j] if slope > 0.0 else low[i, j]) / slope
+        if below > least:
+            least, least_rate = below, rate
+        if above < most:
+            most, most_rate = above, rate
+    return least, most, least_rate - most_rate
 
 
 @entry_point
 def max_path_speeds(
-    first: Floats, second: Floats, velocity: Floats, acceleration: Floats, step: float, x: Floats
+    first: Floats, second: Floats, velocity: Floats, low: Floats, high: Floats, step: float, x: Floats
 ) -> None:
     """Find the largest squared path speeds along a curve, from rest to rest.
 
     Args:
-        first: Derivatives q' by arc length at evenly spaced points, shape (n, dof).
-        second: Derivatives q'', shape (n, dof) [1/rad].
-        velocity: Limits, shape (dof,) [rad/s].
-        acceleration: Limits, shape (dof,) [rad/s^2].
+        first: Derivatives q' by arc length at evenly spaced points, shape (n, rows).
+        second: Derivatives q'', shape (n, rows) [1/rad].
+        velocity: Limits, shape (rows,) [rad/s]; infinite for none.
+        low: Least q' u + q'' x, not positive, shape (n, rows).
+        high: Largest, not negative, shape (n, rows).
         step: Spacing of the points along the curve [rad].
-        x: Gets (ds/dt)^2, shape (n,) [rad^2/s^2].
+        x: Bounds on (ds/dt)^2, shape (n,) [rad^2/s^2]; gets the largest (ds/dt)^2.
     """
-    n, dof = first.shape
+    n, rows = first.shape
     for i in range(n):
-        most = 1e12
-        for j in range(dof):
-            slope, bend = abs(first[i, j]), abs(second[i, j])
+        most = x[i]
+        for j in range(rows):
+            slope, bend = abs(first[i, j]), second[i, j]
             if slope > STILL:
                 most = min(most, (velocity[j] / slope) ** 2)
             elif bend > 0.0:
-                most = min(most, acceleration[j] / bend)
+                most = min(most, high[i, j] / bend)
+            elif bend < 0.0:
+                most = min(most, low[i, j] / bend)
         x[i] = most
     x[n - 1] = 0.0
     for i in range(n - 2, -1, -1):
         at = x[i]
         for _ in range(MOST_STEPS):  # least minus largest u is convex in x and not positive at 0: from the right, exact
-            least, most, rate = _u_range(first, second, acceleration, i, at, x[i + 1], step)
+            least, most, rate = _u_range(first, second, low, high, i, at, x[i + 1], step)
             nearer = max(0.0, at - (least - most) / rate) if rate > 0.0 else 0.0
             if least <= most or not nearer < at:
                 break
@@ -80,7 +87,7 @@ def max_path_speeds(
         x[i] = at
     x[0] = 0.0
     for i in range(n - 1):
-        least, most, _ = _u_range(first, second, acceleration, i, x[i], x[i + 1], step)
+        least, most, _ = _u_range(first, second, low, high, i, x[i], x[i + 1], step)
         u = most if least <= most else 0.5 * (least + most)  # rounding may leave an empty interval
         x[i + 1] = max(0.0, min(x[i + 1], x[i] + 2 * step * u))
 

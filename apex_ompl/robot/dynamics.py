@@ -1,0 +1,114 @@
+"""Inverse dynamics of a robot and what it holds, and speeds of points on it, by Pinocchio.
+
+The torques of the planned joints are tau = M(q) a + C(q, v) v + g(q), by the recursive Newton-Euler algorithm
+(Featherstone 2008). Friction and the inertia of rotors are not part of the model. Masses and inertias of links are
+those of the URDF. Those of the Panda that ships were identified by Gaz et al. (2019); an arm has 16.7 kg.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.robot.model import Robot
+from apex_ompl.types import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Load:
+    """Mass that is fixed to a link.
+
+    Attributes:
+        link: Name of the link.
+        mass: Mass [kg].
+        center: Center of mass in the frame of the link, shape (3,) [m].
+        inertia: Inertia about the center of mass along the axes of the link, shape (3, 3) [kg m^2].
+    """
+
+    link: str
+    mass: float
+    center: Array
+    inertia: Array
+
+
+class Dynamics:
+    """Torques of the planned joints and speeds of points, for states in the order of the robot's."""
+
+    def __init__(self, robot: Robot, loads: Sequence[Load] = (), points: Mapping[str, tuple[str, Array]] | None = None):
+        """Make the model.
+
+        Args:
+            robot: The robot.
+            loads: What it holds.
+            points: Name -> link and position in the frame of the link, shape (3,) [m], of points whose speeds are asked
+                for.
+
+        Raises:
+            UnknownNameError: There is no such link.
+        """
+        self.robot = robot
+        self._model = robot.model.copy()
+        for load in loads:
+            frame = robot.model.frames[robot.link_frame(load.link)]
+            body = pin.Inertia(load.mass, np.asarray(load.center, float), np.asarray(load.inertia, float))
+            self._model.appendBodyToJoint(frame.parentJoint, body, frame.placement)
+        self._points = []
+        for name, (link, position) in (points or {}).items():
+            frame = robot.model.frames[robot.link_frame(link)]
+            place = frame.placement * pin.SE3(np.eye(3), np.asarray(position, float))
+            added = pin.Frame(f"point of {name}", frame.parentJoint, 0, place, pin.FrameType.OP_FRAME)
+            self._points.append(self._model.addFrame(added, False))
+        self._data = self._model.createData()
+
+    @property
+    def mass(self) -> float:
+        """Mass of all moving links and loads [kg]."""
+        return float(sum(body.mass for body in list(self._model.inertias)[1:]))
+
+    def torques(self, q: Array, v: Array | None = None, a: Array | None = None) -> Array:
+        """Return the torques of the planned joints, shape (N, dof) [Nm; N of prismatic joints].
+
+        Args:
+            q: States, shape (N, dof).
+            v: Velocities, shape (N, dof); zero by default.
+            a: Accelerations, shape (N, dof); zero by default.
+        """
+        still = np.zeros_like(q)
+        order = self.robot.to_pinocchio
+        rows = zip(*(order(still if some is None else some) for some in (q, v, a)), strict=True)
+        model, data = self._model, self._data
+        found = np.array([pin.rnea(model, data, *row) for row in rows]).reshape(q.shape)
+        torques = np.empty_like(found)
+        torques[:, self.robot.state_order] = found
+        return torques
+
+    def along(self, q: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
+        """Return the torques along a curve q(s), tau = m u + c x + g with x = (ds/dt)^2 and u = d^2s/dt^2.
+
+        These are m = M q', c = M q'' + C(q, q') q' and g, each of shape (N, dof) (Pham and Pham 2018).
+
+        Args:
+            q: States, shape (N, dof).
+            first: Derivatives q' by arc length, shape (N, dof).
+            second: Derivatives q'', shape (N, dof).
+        """
+        gravity = self.torques(q)
+        return self.torques(q, None, first) - gravity, self.torques(q, first, second) - gravity, gravity
+
+    def speeds(self, q: Array, v: Array) -> Array:
+        """Return the speeds of the points, shape (N, points) [m/s].
+
+        Args:
+            q: States, shape (N, dof).
+            v: Velocities, shape (N, dof).
+        """
+        model, data, order = self._model, self._data, self.robot.to_pinocchio
+        velocities = np.empty((len(q), len(self._points), 3))
+        for row, *at in zip(velocities, order(q), order(v), strict=True):
+            pin.forwardKinematics(model, data, *at)
+            for n, frame in enumerate(self._points):
+                row[n] = pin.getFrameVelocity(model, data, frame, pin.LOCAL).linear
+        return np.asarray(np.linalg.norm(velocities, axis=2))
