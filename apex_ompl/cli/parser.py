@@ -166,6 +166,20 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
             f"--max-{limit}", action="append", default=[], metavar="JOINT=VALUE",
             help=f"a lower limit of {limit} for a joint",
         )  # fmt: skip
+    parser.add_argument(
+        "--max-tool-speed", action="append", default=[], metavar="SPEED or NAME=SPEED",
+        help="largest speed of all hands and held objects, or of single ones [m/s]",
+    )  # fmt: skip
+    parser.add_argument(
+        "--payload", action="append", default=[], metavar="HAND=MASS", help="mass in a hand or at a link [kg]"
+    )
+    parser.add_argument(
+        "--torque-scale", type=float, default=1.0, metavar="SHARE", help="of the limits (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--max-torque", action="append", default=[], metavar="JOINT=VALUE", help="a lower limit of torque for a joint"
+    )
+    parser.add_argument("--no-torque-limits", action="store_true", help="leave torques out of account")
     parser.add_argument("--minimum-duration", type=float, default=0.0, metavar="SECONDS", help="of the motion")
     parser.add_argument(
         "--out", type=Path, metavar="FILE",

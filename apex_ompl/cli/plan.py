@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,16 @@ EXIT_CODES = {
 }
 
 
+def _tool_speeds(given: Sequence[str]) -> float | dict[str, float] | None:
+    """Return the largest speed of all tools, or those by name."""
+    if len(given) == 1 and "=" not in given[0]:
+        try:
+            return float(given[0])
+        except ValueError as error:
+            raise ParameterError("--max-tool-speed", given[0], "a number or NAME=NUMBER") from error
+    return numbers_by_name("--max-tool-speed", given) or None
+
+
 def run(parsed: argparse.Namespace) -> int:
     """Plan, write the result, print it, and return the exit code."""
     if parsed.out is not None:
@@ -44,7 +55,12 @@ def run(parsed: argparse.Namespace) -> int:
     lower: dict[str, Any] = {
         f"max_{limit}": numbers_by_name(f"--max-{limit}", getattr(parsed, f"max_{limit}")) for limit in LIMITS
     }
-    timing = Timing(method=parsed.timing_method, **scales, **lower, minimum_duration=parsed.minimum_duration)
+    timing = Timing(
+        method=parsed.timing_method, **scales, **lower, minimum_duration=parsed.minimum_duration,
+        torque_limits=not parsed.no_torque_limits, torque_scale=parsed.torque_scale,
+        max_torque=numbers_by_name("--max-torque", parsed.max_torque),
+        payload=numbers_by_name("--payload", parsed.payload), max_tool_speed=_tool_speeds(parsed.max_tool_speed),
+    )  # fmt: skip
     result = plan(
         parsed.problem,
         planner=parsed.planner,

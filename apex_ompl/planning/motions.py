@@ -7,18 +7,20 @@ could be reached sooner are tried, too.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from apex_ompl.collision.path_proof import PathProof
+from apex_ompl.errors import TimingError
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import FullCheck, MotionValidator, StateValidityChecker, full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing import TimedPath, Timing, Trajectory
+from apex_ompl.timing import MotionLimits, TimedPath, Timing, Trajectory
 from apex_ompl.timing.duration import DurationOptimizer, direct_durations
+from apex_ompl.timing.parameterization import fitted
 from apex_ompl.timing.timed_spline import TimedSpline
 from apex_ompl.types import Array
 
@@ -31,6 +33,7 @@ GOALS = 3  # other goals to which a straight motion is tried
 SOONER = 0.95  # share of the duration that the lower bound of another goal must not reach
 STATES_PER_KNOT = 2, 4, 8  # of the path along a motion; the first that passes the full check
 SHARE = 0.5  # of the time left
+FITTED = 0.02  # largest deviation of a motion that is timed anew for limits of torques and tool speeds [rad]
 
 
 Check = Callable[[Trajectory], FullCheck]
@@ -54,7 +57,9 @@ def knows_obstacles(setup: PlanningSetup) -> bool:
     return type(checker) is StateValidityChecker and type(validator) is MotionValidator
 
 
-def optimized_motion(query: PlanQuery, path: Path, timing: Timing, check: Check) -> ProvedMotion | None:
+def optimized_motion(
+    query: PlanQuery, path: Path, timing: Timing, check: Check, more: MotionLimits | None = None
+) -> ProvedMotion | None:
     """Return a motion by the query's objective, or None where none is proved in time.
 
     Args:
@@ -62,6 +67,7 @@ def optimized_motion(query: PlanQuery, path: Path, timing: Timing, check: Check)
         path: A valid path.
         timing: The limits.
         check: Full check of a motion.
+        more: Limits of torques and tool speeds.
     """
     setup = query.setup
     limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
@@ -89,7 +95,25 @@ def optimized_motion(query: PlanQuery, path: Path, timing: Timing, check: Check)
             same = _proved(optimizer, spline, check, stop, repairs=0)
             made = _proved(optimizer, optimizer.calmest(spline, duration), check, stop, repairs=0) if calm else None
             found = made or same
-    return None if found is None else _with_path(setup, timing, *found)
+    kept = None if found is None else _kept(found[1], found[2], limits, timing, check, more=more)
+    return None if kept is None else _with_path(setup, timing, *kept)
+
+
+def _kept(
+    motion: Trajectory, proof: PathProof, limits: Limits, timing: Timing, check: Check, *, more: MotionLimits | None
+) -> tuple[Trajectory, PathProof] | None:
+    """Return the motion within limits of torques and tool speeds, and its certificate, or None where none is proved."""
+    if more is None or more.stretch(motion) == 1.0:
+        return motion, proof
+    try:
+        faster = fitted(motion, limits, more, replace(timing, deviation=min(timing.deviation, FITTED))).trajectory
+    except TimingError:  # gravity overloads it
+        return None
+    for candidate in (faster, motion.slower(more.stretch(motion))):
+        checked = check(candidate)
+        if checked and checked.proof is not None:
+            return candidate, checked.proof
+    return None
 
 
 Proved = tuple[TimedSpline, Trajectory, PathProof]
@@ -125,11 +149,8 @@ def _sooner_goals(setup: PlanningSetup, path: Path, limits: Limits, found: Prove
             yield goals[k]
 
 
-def _with_path(
-    setup: PlanningSetup, timing: Timing, spline: TimedSpline, motion: Trajectory, proof: PathProof
-) -> ProvedMotion | None:
+def _with_path(setup: PlanningSetup, timing: Timing, motion: Trajectory, proof: PathProof) -> ProvedMotion | None:
     """Return a motion with the path through its own states, or None where none passes the full check."""
-    del spline
     for count in STATES_PER_KNOT:
         times = np.linspace(0.0, motion.duration, count * (len(motion.times) - 1) + 1)
         states = motion(times)

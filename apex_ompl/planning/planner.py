@@ -283,6 +283,7 @@ class MotionPlanner:
             )
             if timing is not None:
                 derivatives = timing.start(timing.limits(robot.limits, robot.joint_names))  # checked before planning
+                timing.motion_limits(robot, problem.attached, problem.payload)  # checked before planning
                 if derivatives is not None and leave_contact:
                     raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
             checker = self._checker_without({o.name for o in dynamic} if dynamic else self._absent())

@@ -475,6 +475,7 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
     setup, limits, names = query.setup, query.setup.robot.limits, query.setup.robot.joint_names
     proof, found = {"motion": 0.0}, list[FullCheck]()
     scaled = timing.limits(limits, names)
+    more = timing.motion_limits(setup.robot, setup.problem.attached, setup.problem.payload)
 
     def check(motion: Trajectory) -> FullCheck:
         with timed(proof, "motion"):
@@ -490,9 +491,12 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
     by_objective = query.objective != "length" and timing.start(scaled) is None and knows_obstacles(setup)
     try:
         with timed(query.times, "timing"):
-            better = optimized_motion(query, path, timing, check) if by_objective else None
+            if more is not None and (overload := more.gravity_fault(path.states)):
+                raise TimingError(overload)
+            better = optimized_motion(query, path, timing, check, more) if by_objective else None
             straight = len(path.states) == 2 and query.objective != "calm"  # Ruckig's profile may be faster
-            made = time_path(path, limits, names, timing, fault, stop=query.ends) if straight or not better else None
+            along = straight or not better
+            made = time_path(path, limits, names, timing, fault, stop=query.ends, motion_limits=more) if along else None
     except TimingStoppedError:
         return replace(result, status=PlanStatus.TIMEOUT, reason=NOT_TIMED)
     except TimingError as error:
@@ -505,7 +509,8 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         made, motion_proof = better.timed, better.motion_proof
         result = replace(result, path=better.path, **certificate(better.path_proof))
     assert made is not None
+    use = made.trajectory.use(limits) | ({} if more is None else more.use(made.trajectory))
     return replace(
-        result, trajectory=made.trajectory, limit_use=made.trajectory.use(limits), deviation=made.deviation,
+        result, trajectory=made.trajectory, limit_use=use, deviation=made.deviation,
         timing_method=made.method, motion_clearance=nan if motion_proof is None else motion_proof.clearance,
     )  # fmt: skip
