@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from apex_ompl.timing.parameterization import TimedPath, Timing, time_path, warm_up
-from apex_ompl.timing.trajectory import Sample, Trajectory
+from apex_ompl.timing.trajectory import Sample, Trajectory, joined
 
-__all__ = ["Sample", "TimedPath", "Timing", "Trajectory", "time_path", "warm_up"]
+__all__ = ["Sample", "TimedPath", "Timing", "Trajectory", "joined", "time_path", "warm_up"]

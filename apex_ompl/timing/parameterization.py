@@ -17,7 +17,7 @@ from apex_ompl.paths.path import Path
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import ruckig_method, spline_method
 from apex_ompl.timing.curve import SAME_STATE, Polyline, deviation_bound
-from apex_ompl.timing.ruckig_method import Profiles, from_moving_start, joined
+from apex_ompl.timing.ruckig_method import Profiles, from_moving_start
 from apex_ompl.timing.trajectory import Extremes, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
@@ -27,7 +27,8 @@ METHODS = MappingProxyType({"ruckig": ruckig_method.blended, "spline": spline_me
 """Methods by name.
 
 Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad] and a function that
-returns True to end the search; it returns the trajectory and a bound on its distance from the polyline [rad], or None.
+returns True to end the search; it returns the trajectory, a bound on its distance from the polyline [rad] and the name
+of what made it, or None.
 """
 DEFAULT_METHOD = "ruckig"
 
@@ -203,7 +204,7 @@ def time_path(
     start = timing.start(scaled)
     reason, line = "", Polyline.through(states)
     for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop):
-        rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration))
+        rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration).merged())
         for candidate in [rest] if start is None else _from_moving_start(start, rest, line, scaled, timing, stop=stop):
             reason = fault(candidate.trajectory)
             if not reason:
@@ -249,11 +250,11 @@ def _from_rest(
                 if stop():
                     return
                 if motion is not None:
-                    yield TimedPath(*motion, method, "blended")
+                    yield TimedPath(*motion, "blended")
                     break
     motion = ruckig_method.stops(line, limits, joint_names, stop)
     if motion is not None:
-        yield TimedPath(*motion, "ruckig", "line" if straight else "stops")
+        yield TimedPath(*motion, "line" if straight else "stops")
 
 
 def _from_moving_start(
@@ -303,7 +304,7 @@ def warm_up() -> None:
     arc_lengths(max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0), 1.0, 1.0, 1)
     max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
     still = Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False)
-    motion = joined(still, np.zeros((3, 2, 1)), ("joint",))
+    motion = still.joined(np.zeros((3, 2, 1)), ("joint",))
     Trajectory(*motion.knots, ("joint",)).states(motion.times)
     Extremes.of(*motion.knots)
     cubic_rates(motion.knots)

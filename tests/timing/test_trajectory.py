@@ -13,7 +13,7 @@ from scipy.interpolate import CubicSpline
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.robot import Limits
 from apex_ompl.timing import Trajectory
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import joined
 
 NAMES = ("one", "two", "three")
 LIMITS = Limits(*(np.full(3, v) for v in (-2.0, 3.0, 1.5, 4.0, 30.0)))
@@ -104,7 +104,7 @@ def test_motions_are_slowed_cut_and_joined(motion: Trajectory) -> None:
     np.testing.assert_allclose(cut(times[1:9], 2), motion(times[1:9] + 1.0, 2), atol=1e-9)
     assert motion.after(99.0).duration == 0.0
     states = motion.positions[::-1], -motion.velocities[::-1], motion.accelerations[::-1]
-    whole = concatenate([motion, Trajectory(motion.duration - motion.times[::-1], *states, NAMES)])
+    whole = joined([motion, Trajectory(motion.duration - motion.times[::-1], *states, NAMES)])
     assert whole.duration == pytest.approx(2.0 * motion.duration)
     np.testing.assert_allclose(whole(motion.duration + times), motion(motion.duration - times), atol=1e-9)
 
