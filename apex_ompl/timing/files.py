@@ -24,10 +24,12 @@ STATES = ("positions", "velocities", "accelerations")
 KNOTS = ("times", *STATES)
 COLUMN_SUFFIXES = ("", "_velocity", "_acceleration")  # after the name of a joint
 NANOSECONDS = 1_000_000_000  # in a second
-DECIMALS = (12, 9, 6)
-"""Decimals of positions, velocities and accelerations in texts.
+NEAR, FAR = 5e-3, 6e-2
+"""Times between knots below which positions need more decimals, and above which velocities and accelerations do [s]."""
+DECIMALS = {"near": (12, 9, 6), "usual": (10, 8, 6), "far": (12, 12, 12)}
+"""Decimals of positions, velocities and accelerations in texts, by the times between knots.
 
-Between knots 1 ms apart, half a unit in the last of them changes a jerk by 0.06 rad/s^3 at most, farther apart by less.
+Half a unit in the last ones changes jerks by 0.06 rad/s^3 at most, and positions between knots by a nanoradian.
 """
 
 
@@ -55,7 +57,9 @@ def encode(
         arrays: dict[str, Any] = {"times": times, "joint_names": np.array(names), **states}
         np.savez(buffer, **arrays)
         return buffer.getvalue()
-    rows = [_texts(states[name], decimals) for name, decimals in zip(STATES, DECIMALS, strict=True)]
+    gaps = np.diff(times)
+    digits = DECIMALS["far" if gaps.max(initial=0.0) > FAR else "near" if gaps.min(initial=FAR) < NEAR else "usual"]
+    rows = [_texts(states[name], decimals) for name, decimals in zip(STATES, digits, strict=True)]
     ticks = [round(time * NANOSECONDS) for time in times.tolist()]
     if suffix == ".csv":
         header = ["time", *(f"{name}{more}" for more in COLUMN_SUFFIXES for name in names)]

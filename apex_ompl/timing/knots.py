@@ -33,23 +33,23 @@ def is_on_grid(times: Array) -> bool:
 
 
 def spaced(times: Array, spacing: float) -> Array:
-    """Return some of the times of knots, in whole nanoseconds and at least ``spacing`` apart; both ends are kept [s].
+    """Return times of knots in whole nanoseconds, at least ``spacing`` apart, by those of other knots [s].
 
-    Of knots that are nearer to each other the first one is kept. Where fewer than four spans would be left, they are
-    halved.
+    A knot that is nearer to the one before it is moved to that distance, so that the jerk still changes between two
+    near knots; one that is then between knots is left out. Both ends are kept. There are four spans or more.
     """
     grid = on_grid(times)
-    kept = [float(grid[0])]
-    for time in grid[1:-1].tolist():
-        if time - kept[-1] >= spacing - SAME_TIME / NANOSECONDS:
-            kept.append(time)
+    found, least = [float(grid[0])], spacing - SAME_TIME / NANOSECONDS
     end = float(grid[-1])
-    while len(kept) > 1 and end - kept[-1] < spacing - SAME_TIME / NANOSECONDS:
-        kept.pop()
-    found = np.array([*kept, end])
-    while len(found) <= LEAST_SPANS:
-        found = on_grid(np.sort(np.append(found, (found[:-1] + found[1:]) / 2.0)))
-    return found
+    for time in grid[1:-1].tolist():
+        if time > found[-1] and end - time > 0.0:
+            found.append(max(time, found[-1] + spacing))
+    while len(found) > 1 and end - found[-1] < least:
+        found.pop()
+    array = np.array([*found, end])
+    while len(array) <= LEAST_SPANS:
+        array = np.sort(np.append(array, (array[:-1] + array[1:]) / 2.0))
+    return on_grid(array)
 
 
 def removable(accelerations: Array, times: Array, tolerance: Array) -> Flags:

@@ -38,6 +38,7 @@ CALM_TIME = 1.005  # duration of a straight motion over the shortest one, for wh
 JERK_STEPS = 20  # of the bisection for the least jerk
 LEAST_JERK = 1e-3  # share of the limit, or of the largest jerk of a line, below which it is not lowered
 HEAD_SHARES = (1.0, 0.995, 0.98, 0.95)  # of the limits, for motions from a moving start, whose knots are merged
+HEAD_SPACINGS = (8e-3, LEAST_SPACING)  # of their knots, tried in turn [s]
 CALMER = (0.5, 0.25, 0.125, 0.0625)  # shares of the jerk limits that are tried for them
 
 
@@ -395,9 +396,10 @@ def _calm_head(
             if other is None or other.duration > allowed:
                 break
             made = other
-        merged = made.merged()
-        if max(merged.use(limits).values()) <= 1.0 + ROUNDING:
-            return merged
+        for spacing in HEAD_SPACINGS:
+            merged = made.merged(spacing)
+            if max(merged.use(limits).values()) <= 1.0 + ROUNDING:
+                return merged
     return None
 
 

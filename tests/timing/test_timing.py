@@ -66,7 +66,7 @@ def test_ten_thousand_points_keep_the_limits() -> None:
 
 
 @pytest.mark.parametrize("length", [1e-4, 0.01, 0.6, 4.0])
-def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
+def test_a_straight_line_takes_half_a_percent_more_than_the_least_time_there_is(length: float) -> None:
     """Seven phases of constant jerk, each as long as its limit lets it be (Biagiotti and Melchiorri 2008, 3.4)."""
     v, a, j = 2.0, 10.0, 5000.0
     path = np.array([[-length / 2.0, 0.0, 0.0], [length / 2.0, 0.0, 0.0]])
@@ -79,8 +79,13 @@ def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
         least = 4.0 * np.cbrt(length / (2.0 * j))
     made = timed(path)
     assert made.form == "line" and made.deviation == 0.0
-    assert made.trajectory.duration == pytest.approx(least, rel=1e-5)
-    assert keeps_limits(made.trajectory)
+    motion = made.trajectory
+    if length > 1e-3:
+        assert motion.duration == pytest.approx(1.005 * least, rel=5e-4)
+    else:  # its largest acceleration would last for less than a millisecond
+        assert least < motion.duration < 1.05 * least
+    assert keeps_limits(motion) and np.diff(motion.times).min() >= 1e-3 - 1e-12 and len(motion.times) <= 8
+    assert np.abs(motion.jerks).max() < 0.995 * j, "in exchange for the time"
 
 
 @pytest.mark.parametrize("jerk", [1e8, 1e11, 1e12, 1e300, np.inf])
@@ -89,7 +94,8 @@ def test_without_a_limit_of_jerk_motions_are_the_fastest_within_the_others(jerk:
     free = replace(LIMITS, jerk=np.full(3, jerk))
     path = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.4], [0.0, 0.2, 0.0]])
     made = timed(path[:2], limits=free).trajectory
-    assert made.duration == pytest.approx(2.0 * np.sqrt(0.3 / LIMITS.acceleration[0]), rel=1e-5)
+    least = 2.0 * np.sqrt(0.3 / LIMITS.acceleration[0])
+    assert least < made.duration <= 1.0051 * least and np.diff(made.times).min() >= 1e-3 - 1e-12
     for method in METHODS:
         limited, motion = (timed(path, Timing(method), limits=one).trajectory for one in (LIMITS, free))
         assert motion.duration <= limited.duration * (1.0 + 1e-3)
