@@ -10,6 +10,8 @@ from typing import Any
 from apex_ompl.api import plan
 from apex_ompl.cli.options import LIMITS, name_value_pairs, numbers_by_name
 from apex_ompl.errors import ParameterError
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.timing import Timing, Trajectory
@@ -88,9 +90,24 @@ def _save(result: PlanResult, parsed: argparse.Namespace, timing: Timing) -> Non
         }
         controllers = {name: joints for name, joints in groups.items() if joints} if parsed.controllers else None
         limits = timing.limits(robot.limits, robot.joint_names)
+        if parsed.rate is not None:
+            _prove(result, wanted.resampled(parsed.rate, limits), parsed.rate)
         wanted.save(out, controllers, rate=parsed.rate, joints=chosen, limits=limits)
     else:
         result.save(out)
+
+
+def _prove(result: PlanResult, motion: Trajectory, rate: float) -> None:
+    """Check that a motion at another rate is proved free, too.
+
+    Raises:
+        ParameterError: It is not, or obstacles move.
+    """
+    if result.dynamic_obstacles:
+        raise ParameterError("--rate", rate, "none among dynamic obstacles, where the motion's own knots are proved")
+    check = full_check(assemble(result.problem).checker, motion)
+    if not check:
+        raise ParameterError("--rate", rate, f"one at which the motion is proved free; it is not, {check.reason}")
 
 
 def _chosen(given: str | None, robot: Robot) -> list[str]:

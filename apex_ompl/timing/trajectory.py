@@ -19,7 +19,7 @@ from apex_ompl.kernel.timing import motion_extremes, relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.files import NANOSECONDS, STATES, SUFFIXES, decode, encode
 from apex_ompl.timing.knots import LEAST_SPANS, is_on_grid, on_grid, refitted, spaced
-from apex_ompl.timing.smoothness import spectral_arc_length
+from apex_ompl.timing.smoothness import PULSE_SHARE, Smoothness, count_pulses, spectral_arc_length
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import counted, fields_line, html_table, one_line
 from apex_ompl.util.files import path_text, suffix_of, write_atomically
@@ -44,6 +44,7 @@ LEAST_SPACING = 1e-3
 LIMIT_ROOM = 9e-4  # share by which a motion with other knots may exceed a limit; 1e-3 with the rounding in files
 WINDOWS = (0.1, 0.2, 0.4)  # of a motion with other knots, at whose ends it has the same state [s]
 NO_RATE = np.array([[1e-6], [1e-4], [1e-1]])  # velocity, acceleration and jerk that count as none [rad/s^k]
+SAME_COUNT = 1e-6  # part of a span that counts as none
 RATES = (10, 20, 25, 40, 50, 100, 125, 200, 250, 400, 500, 1000)  # that are offered [Hz]
 SAME_STATE = 1e-6  # largest difference of states where motions are joined [rad/s^k]
 STOP_DEVIATION = 1e-3  # of a stop from the path [rad]
@@ -286,6 +287,18 @@ class Trajectory:
         squares = np.sum(self.jerks**2, axis=1)
         return float(np.sqrt(squares @ np.diff(self.times) / self.duration))
 
+    def smoothness(self, limits: Limits, share: float = PULSE_SHARE) -> Smoothness:
+        """Return pulses of the acceleration a second, and the root mean square jerk as a share of the limit, by joint.
+
+        Args:
+            limits: Limits of the joints.
+            share: Share of the acceleration limit above which there is a pulse.
+        """
+        duration = max(self.duration, 1.0 / NANOSECONDS)
+        squares = np.diff(self.times) @ self.jerks**2 if len(self.times) > 1 else np.zeros(self.dof)
+        pulses = count_pulses(self.accelerations, share * limits.acceleration) / duration
+        return Smoothness(pulses, np.sqrt(squares / duration) / limits.jerk)
+
     @property
     def spectral_arc_length(self) -> float:
         """Spectral arc length of the speed |q'|, nearer to 0 for smoother motions; 0 for one without motion."""
@@ -330,8 +343,8 @@ class Trajectory:
 
         It is another motion, which has the same state as this one every 0.1 to 0.4 s. In between it is, for motions of
         two Pandas, some 0.1 mrad from it at 100 Hz and 0.01 mrad at 250 Hz; :meth:`deviation` tells. Both ends are
-        exact. Velocities, accelerations and jerks are at most 1e-3 over the limits. The last knot before the end is at
-        least half a spacing from it.
+        exact. Velocities, accelerations and jerks are at most 1e-3 over the limits. The end is one to two spacings from
+        the knot before it.
 
         Args:
             rate: Knots a second [Hz].
@@ -356,9 +369,9 @@ class Trajectory:
 
     def _evenly(self, rate: float) -> Array:
         """Return times at a rate and the end, in whole nanoseconds, four spans or more."""
-        count = max(LEAST_SPANS, int(self.duration * rate + 0.5))
-        spacing = min(1.0 / rate, self.duration / count) if count == LEAST_SPANS else 1.0 / rate
-        return on_grid(np.append(spacing * np.arange(count), self.duration))
+        count = int(self.duration * rate + SAME_COUNT)
+        spacing = 1.0 / rate if count >= LEAST_SPANS else self.duration / LEAST_SPANS
+        return on_grid(np.append(spacing * np.arange(max(count, LEAST_SPANS)), self.duration))
 
     @property
     def _rates(self) -> Array:

@@ -95,6 +95,12 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
     out = tmp_path / "c.traj.json"
     assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
     assert Trajectory.load(out).dof == 16 and "left_arm_controller" in out.read_text()
+    out = tmp_path / "s.csv"
+    part = ["--rate", "500", "--joints", "right_arm,left_hand_synergy"]
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), *part]) == 0
+    sampled = Trajectory.load(out)
+    assert sampled.joint_names == (*(f"right_joint{k}" for k in range(1, 8)), "left_hand_synergy")
+    np.testing.assert_allclose(np.diff(sampled.times)[:-1], 0.002, atol=1.1e-9)
     out = tmp_path / "r.npz"
     assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out)]) == 0
     saved = PlanResult.load(out)
@@ -114,6 +120,11 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
         (["plot", str(tmp_path / "none.npz"), "-o", str(tmp_path / "q.png")], "none.npz"),
         (["plan", "ball_in_cup", "--jerk-scale", "2"], "jerk_scale"),
         (["plan", "ball_in_cup", "--controllers"], "--controllers"),
+        (["plan", "ball_in_cup", "--rate", "100"], "--rate"),
+        (["plan", "ball_in_cup", "--rate", "0", "--out", str(tmp_path / "q.csv")], "--rate"),
+        (["plan", "ball_in_cup", "--joints", "left_arm", "--out", str(tmp_path / "q.npz")], "--joints"),
+        (["plan", "ball_in_cup", "--joints", "left_foot", "--out", str(tmp_path / "q.csv")], "joint 'left_foot'"),
+        (["plan", "ball_in_cup", "--rate", "5", "--out", str(tmp_path / "q.csv")], "Hz, at which this motion keeps"),
         (["plan", "ball_in_cup", "--no-timing", "--out", str(tmp_path / "q.traj.yaml")], "--no-timing"),
     ):
         capsys.readouterr()

@@ -81,9 +81,10 @@ def test_motions_along_curves_are_calm_and_have_few_knots(seed: int) -> None:
     motion = made.trajectory
     assert made.method == "ruckig" and motion.duration <= 1.0001 * spline.duration
     assert np.diff(motion.times).min() >= 1.0 / 60.0 - 1e-9
-    assert np.median(pulses(motion, wide)) <= 6.0
-    squares = (motion.jerks**2 * np.diff(motion.times)[:, None]).sum(axis=0) / motion.duration
-    assert np.all(np.sqrt(squares) <= 0.15 * wide.jerk)
+    found, dense = motion.smoothness(wide), np.linspace(0.0, motion.duration, 100_001)[:-1]
+    np.testing.assert_allclose(found.pulses, pulses(motion, wide), atol=1e-9)
+    np.testing.assert_allclose(found.jerk, np.sqrt((motion(dense, 3) ** 2).mean(axis=0)) / wide.jerk, rtol=1e-2)
+    assert np.median(found.pulses) <= 6.0 and found.jerk.max() <= 0.15
 
 
 def test_spans_of_nearly_the_same_jerk_are_one_problem() -> None:
@@ -127,7 +128,7 @@ def test_motions_at_a_rate_meet_the_motion_and_keep_its_limits() -> None:
         made = motion.resampled(rate)
         gaps = np.diff(made.times)
         np.testing.assert_allclose(gaps[:-1], 1.0 / rate, atol=1e-9)
-        assert 0.5 / rate <= gaps[-1] + 1e-9 <= 1.5 / rate + 2e-9
+        assert 1.0 / rate - 1e-9 <= gaps[-1] <= 2.0 / rate
         np.testing.assert_array_equal(made.positions[[0, -1]], motion.positions[[0, -1]])
         assert made.deviation(motion) < 1e-4 and motion.deviation(made) == made.deviation(motion)
         dense = np.linspace(0.0, motion.duration, 5001)
