@@ -12,7 +12,7 @@ from timings import LIMITS, NAMES, paths, timed
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Limits
-from apex_ompl.timing import Timing, Trajectory, joined
+from apex_ompl.timing import Timing, Trajectory, joined, ruckig_method
 from apex_ompl.timing.curve import Polyline
 from apex_ompl.timing.ruckig_method import between, calm
 from apex_ompl.timing.spline_method import blend
@@ -68,6 +68,22 @@ def test_ruckig_finds_splines_again(seed: int) -> None:
             own = np.array(solution.at_time(float(since))[0])
             np.testing.assert_allclose(motion(motion.times[k] + since), own, atol=3e-6)
     assert found >= 0.9 * made.problems
+
+
+def test_spans_that_ruckig_cannot_solve_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    guide, asked = random_spline(0), list[float]()
+
+    def calculate(solver: ruckig.Ruckig, query: ruckig.InputParameter, solution: ruckig.Trajectory) -> None:
+        asked.append(query.minimum_duration)
+        if len(asked) <= 4:
+            raise ruckig.RuckigError("no solution")
+        solver.calculate(query, solution)
+
+    monkeypatch.setattr(ruckig_method, "calculate", calculate)
+    made = calm(guide, limits_of(guide))
+    assert made is not None and made.solved == made.problems - 2
+    assert made.method == f"ruckig in {made.solved} of {made.problems} spans"
+    assert made.trajectory.deviation(guide) < 1e-4
 
 
 @settings(max_examples=25)
