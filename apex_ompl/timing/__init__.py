@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from apex_ompl.timing.parameterization import TimedPath, Timing, time_path, warm_up
-from apex_ompl.timing.trajectory import Sample, Trajectory, joined
+from apex_ompl.timing.samples import Sample
+from apex_ompl.timing.trajectory import Trajectory, joined
 
 __all__ = ["Sample", "TimedPath", "Timing", "Trajectory", "joined", "time_path", "warm_up"]

@@ -17,6 +17,7 @@ from apex_ompl.types import Array, Flags
 
 NANOSECONDS = 1e9  # in a second
 SAME_TIME = 1e-4  # largest distance of a time from whole nanoseconds, by rounding [ns]
+SAME_COUNT = 1e-6  # part of a span that counts as none
 LEAST_SPANS = 4  # of a window
 
 
@@ -50,6 +51,20 @@ def spaced(times: Array, spacing: float) -> Array:
     while len(array) <= LEAST_SPANS:
         array = np.sort(np.append(array, (array[:-1] + array[1:]) / 2.0))
     return on_grid(array)
+
+
+def even_times(duration: float, rate: float) -> Array:
+    """Return times at a rate from 0 on, and the end, one to two spacings after the last of them, in whole nanoseconds.
+
+    There are four spans or more, nearer ones in a short motion.
+
+    Args:
+        duration: The end [s].
+        rate: Knots a second [Hz].
+    """
+    count = int(duration * rate + SAME_COUNT)
+    spacing = 1.0 / rate if count >= LEAST_SPANS else duration / LEAST_SPANS
+    return on_grid(np.append(spacing * np.arange(max(count, LEAST_SPANS)), duration))
 
 
 def removable(accelerations: Array, times: Array, tolerance: Array) -> Flags:

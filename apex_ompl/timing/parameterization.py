@@ -18,7 +18,8 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.timing import ruckig_method, spline_method
 from apex_ompl.timing.curve import SAME_STATE, Polyline, deviation_bound
 from apex_ompl.timing.ruckig_method import Profiles, from_moving_start
-from apex_ompl.timing.trajectory import Extremes, Trajectory
+from apex_ompl.timing.samples import Extremes
+from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_array, check_name, check_number, check_positive, check_states, finite_array

@@ -15,8 +15,9 @@ from apex_ompl.kernel.timing import TICK, join_profiles
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.curve import Polyline, deviation_bound
 from apex_ompl.timing.knots import LEAST_SPANS, refitted, removable
+from apex_ompl.timing.samples import Extremes
 from apex_ompl.timing.spline_method import blend
-from apex_ompl.timing.trajectory import LEAST_SPACING, ROUNDING, Extremes, Trajectory, joined
+from apex_ompl.timing.trajectory import LEAST_SPACING, ROUNDING, Trajectory, joined
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import distinct
 
@@ -122,7 +123,8 @@ def blended(
 ) -> tuple[Trajectory, float, str] | None:  # fmt: skip
     """Return Ruckig's motion along a polyline, its corners rounded.
 
-    It follows the fastest spline in time (:func:`apex_ompl.timing.spline_method.blend`) by :func:`calm`.
+    It follows the fastest spline in time (:func:`apex_ompl.timing.spline_method.blend`) by :func:`calm`, where
+    neighboring spans become one state-to-state problem if the motion then keeps ``deviation``.
 
     Args:
         line: The polyline, of positive length.
@@ -138,15 +140,16 @@ def blended(
     guide = blend(line, limits, joint_names, deviation, stop)
     if guide is None:
         return None
-    made = calm(guide.trajectory, limits, stop)
-    if made is None:
-        return None
-    if made.trajectory is guide.trajectory:
-        return made.trajectory, guide.deviation, made.method
-    knot_times, arc = guide.arc_at
-    times = knot_times * (made.trajectory.duration / guide.trajectory.duration)
-    bound = deviation_bound(made.trajectory, line, (times, arc), guide.window, deviation, stop=stop)
-    return (made.trajectory, bound, made.method) if bound <= deviation else None
+    for tolerance in (SAME_PROBLEM, 0.0):
+        made = calm(guide.trajectory, limits, stop, tolerance)
+        if made is None:
+            return None
+        bound = guide.deviation
+        if made.problems < len(guide.trajectory.times) - 1:
+            bound = deviation_bound(made.trajectory, line, guide.arc_at, guide.window, deviation, stop=stop)
+        if bound <= deviation:
+            return made.trajectory, bound, made.method
+    return None
 
 
 class Calm(NamedTuple):
@@ -168,16 +171,18 @@ class Calm(NamedTuple):
         return "ruckig" if self.solved == self.problems else f"ruckig in {self.solved} of {self.problems} spans"
 
 
-def calm(motion: Trajectory, limits: Limits, stop: Callable[[], bool] = lambda: False) -> Calm | None:
+def calm(
+    motion: Trajectory, limits: Limits, stop: Callable[[], bool] = lambda: False, tolerance: float = SAME_PROBLEM
+) -> Calm | None:
     """Return Ruckig's motion that follows a spline in time at the least jerk of each joint.
 
-    1. Neighboring spans in which the accelerations of all joints are within 1 % of the limits on a line become one
-       state-to-state problem, where the motion with fewer knots keeps the limits.
-    2. In each problem, of duration h, each joint has a jerk limit that is 1e-4 over its jerk J on the way. Ruckig's
-       motion between the states at both ends has this duration and jerks |j| <= |J| + d, so that its accelerations
-       are within d h, and its positions within d h^3 / 2 of those with the jerk J: a microradian.
-    3. Its phases are as short as d / |J| of the problem, but for one. They are merged into that one, so that the knots
-       are those of the problems.
+    1. Neighboring spans in which the accelerations of all joints are nearly on a line become one state-to-state
+       problem, where the motion with fewer knots keeps the limits.
+    2. In each problem, of duration h, the jerk limit of each joint is a little over its jerk J on the way: |J| + d.
+       Ruckig's motion between the states at both ends has this duration and keeps that limit. So its accelerations are
+       within d h and its positions within d h^3 / 4 of those with the constant jerk J, some microradians.
+    3. But for one, its phases last microseconds. They are merged into that one, so that the knots are the ends of the
+       problems.
 
     Where Ruckig finds no motion of the duration h, the given motion is kept.
 
@@ -185,12 +190,13 @@ def calm(motion: Trajectory, limits: Limits, stop: Callable[[], bool] = lambda: 
         motion: Motion of constant jerk between knots, within the limits.
         limits: Limits of the joints.
         stop: Called before every state-to-state problem; True ends the search.
+        tolerance: Distance from the line, as a share of the acceleration limits; with 0 every span is a problem.
 
     Returns:
         The motion, which takes as long as the given one and has the same ends; or None when ``stop`` returned True.
     """
-    motion = _fewer_problems(motion.merged(), limits)
-    if motion.dof == 0 or len(motion.times) == 1:
+    motion = _fewer_problems(motion.merged(), limits, tolerance) if tolerance else motion.merged()
+    if len(motion.times) == 1:
         return Calm(motion, 0, 0)
     solver, query = ruckig.Ruckig(motion.dof), ruckig.InputParameter(motion.dof)
     solution = ruckig.Trajectory(motion.dof)
@@ -224,15 +230,15 @@ def calm(motion: Trajectory, limits: Limits, stop: Callable[[], bool] = lambda: 
     return Calm(motion, len(lengths), solved)
 
 
-def _fewer_problems(motion: Trajectory, limits: Limits) -> Trajectory:
+def _fewer_problems(motion: Trajectory, limits: Limits, tolerance: float) -> Trajectory:
     """Return a motion without the knots that are in the middle of one problem, where it keeps the limits."""
-    removed = removable(motion.accelerations, motion.times, SAME_PROBLEM * limits.acceleration)
+    removed = removable(motion.accelerations, motion.times, tolerance * limits.acceleration)
     if not removed.any() or len(motion.times) - removed.sum() <= LEAST_SPANS:
         return motion
     times = motion.times[~removed]
     states = refitted(motion.states(times), times, WINDOW)
     fewer = Trajectory.unchecked(times, states, motion.joint_names)
-    return fewer if max(fewer.use(limits).values()) <= 1.0 else motion
+    return fewer if max(fewer.use(limits).values()) <= 1.0 + ROUNDING else motion
 
 
 def stops(

@@ -5,17 +5,19 @@ The smoothness S_r of the paper, the sum of joint-space steps, is :func:`apex_om
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.paths.path import resample
+from apex_ompl.robot.model import Limits
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_path, check_positive, number_array
 
 PULSE_SHARE = 0.3  # of the acceleration limit, above which there is a pulse
+SHORTEST = 1e-9  # duration that a motion counts for at least [s]
 STEPS = 128  # of even length that a path is resampled to for its jerk
 
 
@@ -48,6 +50,22 @@ class Smoothness(NamedTuple):
 
     pulses: Array
     jerk: Array
+
+    @classmethod
+    def of(cls, times: Array, accelerations: Array, limits: Limits, share: float = PULSE_SHARE) -> Self:
+        """Return that of a motion with constant jerk between knots.
+
+        Args:
+            times: Of the knots, shape (K,) [s].
+            accelerations: At the knots, shape (K, dof) [rad/s^2].
+            limits: Limits of the joints.
+            share: Share of the acceleration limit above which there is a pulse.
+        """
+        gaps, changes = np.diff(times), np.diff(accelerations, axis=0)
+        duration = max(float(times[-1]), SHORTEST)
+        squares = (changes**2 / gaps[:, None]).sum(axis=0)
+        pulses = count_pulses(accelerations, share * limits.acceleration) / duration
+        return cls(pulses, np.sqrt(squares / duration) / limits.jerk)
 
 
 def count_pulses(accelerations: Array, thresholds: Array) -> NDArray[np.intp]:

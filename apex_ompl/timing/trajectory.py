@@ -8,20 +8,20 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.kernel.moving import LimitArrays, stop_joints, stop_on_path
-from apex_ompl.kernel.timing import motion_extremes, relative_gap, sample_motion
+from apex_ompl.kernel.timing import relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.files import NANOSECONDS, STATES, SUFFIXES, decode, encode
-from apex_ompl.timing.knots import LEAST_SPANS, is_on_grid, on_grid, refitted, spaced
-from apex_ompl.timing.smoothness import PULSE_SHARE, Smoothness, count_pulses, spectral_arc_length
-from apex_ompl.types import Array, Flags
-from apex_ompl.util.display import counted, fields_line, html_table, one_line
+from apex_ompl.timing.knots import LEAST_SPANS, even_times, is_on_grid, refitted, spaced
+from apex_ompl.timing.samples import Extremes, Sample
+from apex_ompl.timing.smoothness import PULSE_SHARE, Smoothness, spectral_arc_length
+from apex_ompl.types import Array
+from apex_ompl.util.display import counted, html_table, one_line
 from apex_ompl.util.files import path_text, suffix_of, write_atomically
 from apex_ompl.util.validation import (
     check_array,
@@ -37,69 +37,15 @@ CONTINUITY_TOLERANCE = 1e-6  # relative error of a knot integrated from the one 
 MAX_SAMPLES = 10**7
 BLOCK = 1000  # samples of a stream that are computed at once
 SPEED_SPACING, MAX_SPEED_SAMPLES = 0.001, 2**15  # of the speed profile for the spectral arc length [s]
-AT_REST = 1e-6
-"""Largest velocity of a joint at rest [rad/s]."""
 LEAST_SPACING = 1e-3
 """Least time between knots for a controller [s]."""
 LIMIT_ROOM = 9e-4  # share by which a motion with other knots may exceed a limit; 1e-3 with the rounding in files
 WINDOWS = (0.1, 0.2, 0.4)  # of a motion with other knots, at whose ends it has the same state [s]
 NO_RATE = np.array([[1e-6], [1e-4], [1e-1]])  # velocity, acceleration and jerk that count as none [rad/s^k]
-SAME_COUNT = 1e-6  # part of a span that counts as none
 RATES = (10, 20, 25, 40, 50, 100, 125, 200, 250, 400, 500, 1000)  # that are offered [Hz]
 SAME_STATE = 1e-6  # largest difference of states where motions are joined [rad/s^k]
 STOP_DEVIATION = 1e-3  # of a stop from the path [rad]
 STOP_SHARES = (1.0, 0.99, 0.97, 0.9)  # of the limits, for a stop joint by joint whose knots are merged
-
-
-class Extremes(NamedTuple):
-    """Least and largest positions, largest velocities, accelerations and jerks of a motion, each of shape (dof,).
-
-    Jerks are lower bounds within the rounding of the knots. Knots of different joints may be 1e-10 s apart, and there
-    the rounding of times and accelerations alone changes a jerk by 1e-6 of it and more.
-    """
-
-    low: Array
-    high: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-
-    @classmethod
-    def of(cls, times: Array, positions: Array, velocities: Array, accelerations: Array) -> Self:
-        """Return the extremes of a motion: :func:`apex_ompl.kernel.timing.motion_extremes`.
-
-        Args:
-            times: Times of the knots, shape (K,) [s].
-            positions: At the knots, shape (K, dof).
-            velocities: At the knots, shape (K, dof).
-            accelerations: At the knots, shape (K, dof).
-        """
-        return cls(*motion_extremes((times, positions, velocities, accelerations)))
-
-    def slower(self, factor: float) -> Self:
-        """Return the extremes of the same motion in a time that is ``factor`` times as long."""
-        rest = self.velocity / factor, self.acceleration / factor**2, self.jerk / factor**3
-        return type(self)(self.low, self.high, *rest)
-
-
-class Sample(NamedTuple):
-    """State of a trajectory at one time, or at several.
-
-    Attributes:
-        time: Time since the start, a number or shape (N,) [s].
-        position: Shape (..., dof) [rad; synergies 0..1].
-        velocity: Shape (..., dof) [rad/s].
-        acceleration: Shape (..., dof) [rad/s^2].
-    """
-
-    time: float | Array
-    position: Array
-    velocity: Array
-    acceleration: Array
-
-    def __repr__(self) -> str:
-        """Return the time and the shapes of the rest."""
-        return fields_line(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,10 +240,7 @@ class Trajectory:
             limits: Limits of the joints.
             share: Share of the acceleration limit above which there is a pulse.
         """
-        duration = max(self.duration, 1.0 / NANOSECONDS)
-        squares = np.diff(self.times) @ self.jerks**2 if len(self.times) > 1 else np.zeros(self.dof)
-        pulses = count_pulses(self.accelerations, share * limits.acceleration) / duration
-        return Smoothness(pulses, np.sqrt(squares / duration) / limits.jerk)
+        return Smoothness.of(self.times, self.accelerations, limits, share)
 
     @property
     def spectral_arc_length(self) -> float:
@@ -336,7 +279,7 @@ class Trajectory:
         spacing = min(spacing, self.duration / (2 * LEAST_SPANS))
         if not gaps.size or (gaps.min() >= spacing * (1.0 - 1e-6) and is_on_grid(self.times)):
             return self
-        return self._at_knots(spaced(self.times, spacing), self._rates)[0]
+        return self._at_knots(spaced(self.times, spacing), self._extremes.rates)[0]
 
     def resampled(self, rate: float, limits: Limits | None = None) -> Trajectory:
         """Return the motion with knots at a rate, and at its end; the jerk is constant between them.
@@ -358,25 +301,16 @@ class Trajectory:
             return self
         if rate * self.duration > MAX_SAMPLES or rate > 1.0 / LEAST_SPACING:
             raise ParameterError("rate", rate, f"at most {1.0 / LEAST_SPACING:g} Hz")
-        bounds = self._rates if limits is None else np.stack([limits.velocity, limits.acceleration, limits.jerk])
-        made, excess = self._at_knots(self._evenly(rate), bounds)
+        bounds = (
+            self._extremes.rates if limits is None else np.stack([limits.velocity, limits.acceleration, limits.jerk])
+        )
+        made, excess = self._at_knots(even_times(self.duration, rate), bounds)
         if excess <= LIMIT_ROOM:
             return made
         for higher in RATES:
-            if higher > rate and self._at_knots(self._evenly(higher), bounds)[1] <= LIMIT_ROOM:
+            if higher > rate and self._at_knots(even_times(self.duration, higher), bounds)[1] <= LIMIT_ROOM:
                 raise ParameterError("rate", rate, f"at least {higher} Hz, at which this motion keeps its limits")
         raise ParameterError("rate", rate, "none: the motion keeps its limits with its own knots only")
-
-    def _evenly(self, rate: float) -> Array:
-        """Return times at a rate and the end, in whole nanoseconds, four spans or more."""
-        count = int(self.duration * rate + SAME_COUNT)
-        spacing = 1.0 / rate if count >= LEAST_SPANS else self.duration / LEAST_SPANS
-        return on_grid(np.append(spacing * np.arange(max(count, LEAST_SPANS)), self.duration))
-
-    @property
-    def _rates(self) -> Array:
-        """Largest velocities, accelerations and jerks, shape (3, dof)."""
-        return np.stack(self._extremes[2:])
 
     def _at_knots(self, times: Array, bounds: Array) -> tuple[Trajectory, float]:
         """Return the motion with other knots, and by which share it exceeds bounds of the rates, shape (3, dof)."""
@@ -386,7 +320,7 @@ class Trajectory:
         best, least = self, np.inf
         for window in WINDOWS:
             made = Trajectory.unchecked(times, refitted(states, times, window), self.joint_names)
-            excess = float(((made._rates - bounds) / np.maximum(bounds, NO_RATE)).max())
+            excess = float(((made._extremes.rates - bounds) / np.maximum(bounds, NO_RATE)).max())
             if excess < least:
                 best, least = made, excess
             if excess <= LIMIT_ROOM or self.duration <= window:
@@ -575,38 +509,3 @@ def joined(parts: Sequence[Trajectory]) -> Trajectory:
     times = [part.times[(k > 0) :] + end for k, (part, end) in enumerate(zip(parts, ends[:-1], strict=True))]
     states = [np.concatenate([getattr(part, name)[(k > 0) :] for k, part in enumerate(parts)]) for name in STATES]
     return Trajectory(np.concatenate(times), states[0], states[1], states[2], parts[0].joint_names)
-
-
-def is_at_rest(motion: Trajectory, time: float) -> bool:
-    """Whether no joint is faster than ``AT_REST`` at a time [s]; before 0 and after the end the robot is at rest."""
-    return bool((np.abs(motion(time, 1)) <= AT_REST).all())
-
-
-def rests(motion: Trajectory) -> Array:
-    """Return the intervals of time in which a motion is at rest, shape (N, 2) [s].
-
-    In each, no joint is ever faster than ``AT_REST``. A moment of rest between two moving pieces is an interval
-    of length zero. Starts and ends of intervals are knots.
-    """
-    slow = np.all(np.abs(motion.velocities) <= AT_REST, axis=1).tolist()
-    resting = _is_resting(motion)
-    found, k, last = list[tuple[int, int]](), 0, len(slow) - 1
-    while k <= last:
-        if slow[k]:
-            end = k
-            while end < last and resting[end]:
-                end += 1
-            found.append((k, end))
-            k = end
-        k += 1
-    return np.asarray(motion.times[np.array(found, int).reshape(-1, 2)])
-
-
-def _is_resting(motion: Trajectory) -> Flags:
-    """Return whether each piece between knots is at rest, shape (K - 1,)."""
-    v, a, j, t = motion.velocities, motion.accelerations[:-1], motion.jerks, np.diff(motion.times)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        turn = np.clip(np.nan_to_num(-a / j), 0.0, t)  # where the velocity is extreme
-    inner = np.abs(v[:-1] + turn * (a + turn * j / 2.0))
-    fastest = np.maximum(np.maximum(np.abs(v[:-1]), np.abs(v[1:])), inner)
-    return np.asarray((fastest <= AT_REST).all(axis=1))

@@ -19,7 +19,8 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import load_same_robot
-from apex_ompl.timing.trajectory import Trajectory, rests
+from apex_ompl.timing.rests import rests
+from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.files import suffix_of, write_atomically
 from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, PATH_COLORS, SILENT_EVENTS

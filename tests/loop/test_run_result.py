@@ -18,7 +18,8 @@ from apex_ompl.loop.metrics import failure_ratio, run_metrics
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.robot import Robot
 from apex_ompl.timing.files import KNOTS
-from apex_ompl.timing.trajectory import is_at_rest, joined, rests
+from apex_ompl.timing.rests import is_at_rest, rests
+from apex_ompl.timing.trajectory import joined
 
 
 @pytest.fixture(scope="module")
