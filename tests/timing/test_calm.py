@@ -109,7 +109,9 @@ def test_spans_of_nearly_the_same_jerk_are_one_problem() -> None:
     assert guide is not None
     made = calm(guide.trajectory, LIMITS)
     assert made is not None and made.problems < len(guide.trajectory.times) - 1
-    assert max(made.trajectory.use(LIMITS).values()) <= 1.0 + 1e-9 and made.trajectory.deviation(guide.trajectory) < 1e-3
+    assert (
+        max(made.trajectory.use(LIMITS).values()) <= 1.0 + 1e-9 and made.trajectory.deviation(guide.trajectory) < 1e-3
+    )
     assert calm(guide.trajectory, LIMITS, lambda: True) is None
 
 
