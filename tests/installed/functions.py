@@ -177,6 +177,7 @@ def _use_trajectories() -> None:
     rest = apex_ompl.time_path(np.stack([stopped.positions[-1], path[-1]]), robot.limits, robot.joint_names, timing)
     whole = apex_ompl.timing.joined([stopped, rest.trajectory])
     assert whole.deviation(whole.resampled(1000.0)) < 1e-3 and whole.before(0.1).duration == 0.1
+    assert whole.smoothness(robot.limits).jerk.max() < 1.0
     assert whole.saved(rate=1000.0, joints=robot.joint_names[:2]).dof == whole.selected(robot.joint_names[:2]).dof == 2
     assert apex_ompl.Trajectory.unchecked(motion.times, motion.states(motion.times), motion.joint_names).duration
     for name in ("motion.npz", "motion.csv", "motion.traj.yaml", "motion.traj.json"):
