@@ -188,6 +188,13 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--controllers", action="store_true", help="one ROS 2 message for each group of joints in .traj files"
     )
+    parser.add_argument(
+        "--rate", type=float, metavar="HZ",
+        help="points a second in .traj files and .csv (default: the motion's own, at most 60 or so)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--joints", metavar="A,B,...", help="joints or groups of joints in .traj files and .csv (default: all)"
+    )
     parser.add_argument("--json", action="store_true", help="print the whole result as JSON")
     parser.set_defaults(run="plan:run")
 

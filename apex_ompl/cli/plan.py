@@ -6,18 +6,22 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from apex_ompl.api import plan
 from apex_ompl.cli.options import LIMITS, name_value_pairs, numbers_by_name
 from apex_ompl.errors import ParameterError
+from apex_ompl.ompl.setup import assemble
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus
-from apex_ompl.robot import load_robot
-from apex_ompl.timing import Timing
+from apex_ompl.robot import Robot, load_robot
+from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.files import MESSAGES
 from apex_ompl.util.files import check_writable, suffix_of
 from apex_ompl.util.schema import read_yaml
+from apex_ompl.util.validation import check_name, check_positive
+
+MOTIONS = (*MESSAGES, ".csv")  # files of motions alone
 
 EXIT_CODES = {
     PlanStatus.EXACT_SOLUTION: 0,
@@ -51,6 +55,13 @@ def run(parsed: argparse.Namespace) -> int:
         raise ParameterError("--controllers", str(parsed.out), f"--out with a name ending in {' or '.join(MESSAGES)}")
     if parsed.no_timing and parsed.out is not None and parsed.out.name.endswith(MESSAGES):
         raise ParameterError("--no-timing", str(parsed.out), "timing, without which there is no motion to write")
+    if parsed.rate is not None:
+        check_positive(parsed.rate, "--rate", "a positive number of points a second")
+    for option in ("rate", "joints"):
+        if getattr(parsed, option) is not None and (parsed.out is None or not parsed.out.name.endswith(MOTIONS)):
+            raise ParameterError(f"--{option}", str(parsed.out), f"--out with a name ending in {', '.join(MOTIONS)}")
+        if getattr(parsed, option) is not None and parsed.no_timing:
+            raise ParameterError(f"--{option}", "--no-timing", "timing, without which there is no motion")
     scales: dict[str, Any] = {f"{limit}_scale": getattr(parsed, f"{limit}_scale") for limit in LIMITS}
     lower: dict[str, Any] = {
         f"max_{limit}": numbers_by_name(f"--max-{limit}", getattr(parsed, f"max_{limit}")) for limit in LIMITS
@@ -75,22 +86,53 @@ def run(parsed: argparse.Namespace) -> int:
         leave_contact=parsed.leave_contact,
     )
     if parsed.out is not None:
-        _save(result, parsed.out, timed=not parsed.no_timing, controllers=parsed.controllers)
+        _save(result, parsed, timing)
     print(json.dumps(result.as_dict()) if parsed.json else result)
     return EXIT_CODES.get(result.status, 1)
 
 
-def _save(result: PlanResult, out: Path, *, timed: bool, controllers: bool) -> None:
+def _save(result: PlanResult, parsed: argparse.Namespace, timing: Timing) -> None:
     """Write a result, its motion or its path, as the suffix asks; print a note when there is none."""
-    suffix = suffix_of(out, SUFFIXES)
+    out, timed = parsed.out, not parsed.no_timing
     wanted: object = result
-    if suffix in (*MESSAGES, ".csv"):
+    if suffix_of(out, SUFFIXES) in MOTIONS:
         wanted = result.trajectory if timed else result.path
     if wanted is None:
         print(f"apex-ompl: note: no {'motion' if timed else 'path'}, so {out} is not written", file=sys.stderr)
-    elif controllers and result.trajectory is not None:
+    elif isinstance(wanted, Trajectory):
         robot = load_robot(result.problem.robot)
-        groups = {f"{name}_controller": [robot.joint_names[k] for k in group] for name, group in robot.groups.items()}
-        result.trajectory.save(out, groups)
+        chosen = _chosen(parsed.joints, robot)
+        groups = {
+            f"{name}_controller": [robot.joint_names[k] for k in group if robot.joint_names[k] in chosen]
+            for name, group in robot.groups.items()
+        }
+        controllers = {name: joints for name, joints in groups.items() if joints} if parsed.controllers else None
+        limits = timing.limits(robot.limits, robot.joint_names)
+        if parsed.rate is not None:
+            _prove(result, wanted.resampled(parsed.rate, limits), parsed.rate)
+        wanted.save(out, controllers, rate=parsed.rate, joints=chosen, limits=limits)
     else:
         result.save(out)
+
+
+def _prove(result: PlanResult, motion: Trajectory, rate: float) -> None:
+    """Check that a motion at another rate is proved free, too.
+
+    Raises:
+        ParameterError: It is not, or obstacles move.
+    """
+    if result.dynamic_obstacles:
+        raise ParameterError("--rate", rate, "none among dynamic obstacles, where the motion's own knots are proved")
+    check = full_check(assemble(result.problem).checker, motion)
+    if not check:
+        raise ParameterError("--rate", rate, f"one at which the motion is proved free; it is not, {check.reason}")
+
+
+def _chosen(given: str | None, robot: Robot) -> list[str]:
+    """Return the names of joints in a list of joints and groups of joints, by default all."""
+    if given is None:
+        return list(robot.joint_names)
+    groups = {name: [robot.joint_names[k] for k in group] for name, group in robot.groups.items()}
+    known = (*groups, *robot.joint_names)
+    names = [check_name(name.strip(), "joint", known) for name in given.split(",")]
+    return list(dict.fromkeys(joint for name in names for joint in groups.get(name, [name])))

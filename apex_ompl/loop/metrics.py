@@ -12,7 +12,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import GOING, Event, Outcome, RunResult
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
-from apex_ompl.timing.trajectory import rests
+from apex_ompl.timing.rests import rests
 from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import check_number
 

@@ -28,7 +28,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.checks import SAME_STATE
-from apex_ompl.timing.trajectory import AT_REST, is_at_rest
+from apex_ompl.timing.rests import AT_REST, is_at_rest
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_states
 

@@ -20,7 +20,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.checks import SAME_STATE
 from apex_ompl.timing.timed_spline import Start
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import joined
 from apex_ompl.types import Array
 
 SAME_TIME = 1e-9  # [s]
@@ -54,7 +54,7 @@ class Following:
 
     def after(self, head: Trajectory, start_time: float) -> Following:
         """Return the motion after another one, which starts at a clock time [s] and ends where this one starts."""
-        return Following(concatenate([head, self.motion]), start_time, self.to_goal)
+        return Following(joined([head, self.motion]), start_time, self.to_goal)
 
     def at(self, time: float) -> Start:
         """Return position, velocity and acceleration at a clock time [s]."""
@@ -78,7 +78,7 @@ class Following:
             q = np.repeat(self.motion.positions[[-1 if self.at_rest(start) else 0]], len(times), axis=0)
             return Trajectory(times, q, np.zeros_like(q), np.zeros_like(q), self.motion.joint_names)
         if start < self.start_time - SAME_TIME:
-            return concatenate([self.piece(start, self.start_time), self.piece(self.start_time, end)])
+            return joined([self.piece(start, self.start_time), self.piece(self.start_time, end)])
         last = min(end, self.end) - self.start_time
         first, times = start - self.start_time, self.motion.times
         inner = times[(times > first + SAME_TIME) & (times < last - SAME_TIME)]
@@ -87,7 +87,7 @@ class Following:
         moving = Trajectory(at - at[0], q, v, a, self.motion.joint_names)
         if end - self.end <= SAME_TIME:
             return moving
-        return concatenate([moving, self.piece(self.end, end)])
+        return joined([moving, self.piece(self.end, end)])
 
 
 def executed(followed: list[tuple[float, Following]], end: float) -> Trajectory:
@@ -101,7 +101,7 @@ def executed(followed: list[tuple[float, Following]], end: float) -> Trajectory:
     pieces = [
         one.piece(start, until) for (start, one), until in zip(followed, ends, strict=True) if until > start + SAME_TIME
     ]
-    return concatenate(pieces) if pieces else followed[-1][1].motion
+    return joined(pieces) if pieces else followed[-1][1].motion
 
 
 @dataclass(eq=False)

@@ -17,7 +17,7 @@ from apex_ompl.ompl.setup import PlanningSetup, assemble, state_fault
 from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult
 from apex_ompl.timing import Timing, time_path
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import joined
 from apex_ompl.types import Array
 
 LARGEST_DEPTH = 1e-3  # of contacts that the refusal of a start names ``leave_contact`` for [m]
@@ -136,7 +136,7 @@ def with_departure(result: PlanResult, setup: PlanningSetup, departure: Departur
     limits, names = setup.robot.limits, setup.robot.joint_names
     line = Path(np.stack([departure.start, departure.end]))
     first = time_path(line, limits, names, replace(timing, minimum_duration=0.0)).trajectory
-    motion = concatenate([first, result.trajectory])
+    motion = joined([first, result.trajectory])
     return replace(result, path=path, trajectory=motion, limit_use=motion.use(limits))
 
 

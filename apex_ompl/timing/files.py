@@ -5,12 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.types import Array
@@ -25,6 +24,13 @@ STATES = ("positions", "velocities", "accelerations")
 KNOTS = ("times", *STATES)
 COLUMN_SUFFIXES = ("", "_velocity", "_acceleration")  # after the name of a joint
 NANOSECONDS = 1_000_000_000  # in a second
+NEAR, FAR = 5e-3, 6e-2
+"""Times between knots below which positions need more decimals, and above which velocities and accelerations do [s]."""
+DECIMALS = {"near": (12, 9, 6), "usual": (10, 8, 6), "far": (12, 12, 12)}
+"""Decimals of positions, velocities and accelerations in texts, by the times between knots.
+
+Half a unit in the last ones changes jerks by 0.06 rad/s^3 at most, and positions between knots by a nanoradian.
+"""
 
 
 def encode(
@@ -51,23 +57,26 @@ def encode(
         arrays: dict[str, Any] = {"times": times, "joint_names": np.array(names), **states}
         np.savez(buffer, **arrays)
         return buffer.getvalue()
+    gaps = np.diff(times)
+    digits = DECIMALS["far" if gaps.max(initial=0.0) > FAR else "near" if gaps.min(initial=FAR) < NEAR else "usual"]
+    rows = [_texts(states[name], decimals) for name, decimals in zip(STATES, digits, strict=True)]
+    ticks = [round(time * NANOSECONDS) for time in times.tolist()]
     if suffix == ".csv":
         header = ["time", *(f"{name}{more}" for more in COLUMN_SUFFIXES for name in names)]
-        table = np.hstack([times[:, None], *(states[name] for name in STATES)])
         text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([header, *([repr(v) for v in row] for row in table.tolist())])
+        seconds = ("{}.{:09}".format(*divmod(tick, NANOSECONDS)) for tick in ticks)
+        table = ([time, *q, *v, *a] for time, q, v, a in zip(seconds, *rows, strict=True))
+        csv.writer(text, lineterminator="\n").writerows([header, *table])
         return text.getvalue().encode()
-    message: dict[str, Any]
+    write = _json_message if suffix == ".traj.json" else _yaml_message
     if controllers is None:
-        message = _message(times, states, names, range(len(names)))
-    else:
-        columns = {name: [list(names).index(joint) for joint in joints] for name, joints in controllers.items()}
-        message = {name: _message(times, states, names, chosen) for name, chosen in columns.items()}
+        return write(ticks, rows, names, range(len(names)), "").encode()
+    columns = {name: [list(names).index(joint) for joint in joints] for name, joints in controllers.items()}
     if suffix == ".traj.json":
-        return (json.dumps(message) + "\n").encode()
-    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    content: str = yaml.dump(message, Dumper=dumper, default_flow_style=None, sort_keys=False, width=1_000_000)
-    return content.encode()
+        messages = (f"{json.dumps(name)}: {write(ticks, rows, names, chosen, '')}" for name, chosen in columns.items())
+        return ("{\n" + ",\n".join(message.rstrip("\n") for message in messages) + "\n}\n").encode()
+    messages = (f"{json.dumps(name)}:\n{write(ticks, rows, names, chosen, '  ')}" for name, chosen in columns.items())
+    return "".join(messages).encode()
 
 
 def decode(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
@@ -91,21 +100,56 @@ def decode(path: Path) -> tuple[Array, list[Array], tuple[str, ...]]:
         raise FileFormatError(str(path), "", str(error), "expected a saved trajectory") from error
 
 
-def _message(times: Array, states: Mapping[str, Array], names: Sequence[str], columns: Sequence[int]) -> dict[str, Any]:
-    """Return a ``trajectory_msgs/JointTrajectory``."""
-    rounded = [round(time * NANOSECONDS) for time in times.tolist()]
-    if len(set(rounded)) < len(rounded):
-        raise ParameterError(
-            "times", float(np.diff(times).min()), "knots at least a nanosecond apart, the resolution of ROS 2"
-        )
-    stamps = [divmod(time, NANOSECONDS) for time in rounded]
-    chosen = {name: states[name][:, list(columns)].tolist() for name in STATES}
-    points = [
-        {**{name: chosen[name][k] for name in STATES}, "effort": [], "time_from_start": {"sec": sec, "nanosec": nano}}
-        for k, (sec, nano) in enumerate(stamps)
+def _texts(values: Array, decimals: int) -> list[list[str]]:
+    """Return rounded numbers as texts that JSON and YAML read as floats, without exponents; the ends are not rounded.
+
+    Args:
+        values: Shape (K, dof).
+        decimals: Number of decimals at most.
+    """
+
+    def text(value: float) -> str:
+        head, _, tail = f"{value:.{decimals}f}".partition(".")
+        tail = tail.rstrip("0") or "0"
+        return "0.0" if tail == "0" and head == "-0" else f"{head}.{tail}"
+
+    exact = {0, len(values) - 1}
+    return [
+        [np.format_float_positional(value, trim="0") for value in row] if k in exact else [text(value) for value in row]
+        for k, row in enumerate(values.tolist())
     ]
-    header = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
-    return {"header": header, "joint_names": [names[c] for c in columns], "points": points}
+
+
+def _points(ticks: Sequence[int], rows: Sequence[list[list[str]]], columns: Sequence[int]) -> Iterator[str]:
+    """Return the points of a message one by one, as JSON, which YAML reads, too."""
+    for k, tick in enumerate(ticks):
+        lists = (
+            f'"{name}": [{", ".join(values[k][c] for c in columns)}]' for name, values in zip(STATES, rows, strict=True)
+        )
+        sec, nanosec = divmod(tick, NANOSECONDS)
+        stamp = f'"time_from_start": {{"sec": {sec}, "nanosec": {nanosec}}}'
+        yield f'{{{", ".join(lists)}, "effort": [], {stamp}}}'
+
+
+HEADER = '{"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}'
+
+
+def _json_message(
+    ticks: Sequence[int], rows: Sequence[list[list[str]]], names: Sequence[str], columns: Sequence[int], indent: str
+) -> str:
+    """Return a ``trajectory_msgs/JointTrajectory`` of some of the joints as JSON, a point a line."""
+    points = f",\n{indent}".join(_points(ticks, rows, columns))
+    joints = json.dumps([names[c] for c in columns])
+    return f'{{"header": {HEADER}, "joint_names": {joints}, "points": [\n{indent}{points}\n{indent}]}}\n'
+
+
+def _yaml_message(
+    ticks: Sequence[int], rows: Sequence[list[list[str]]], names: Sequence[str], columns: Sequence[int], indent: str
+) -> str:
+    """Return a ``trajectory_msgs/JointTrajectory`` of some of the joints as YAML, a point a line."""
+    head = f"header: {HEADER}", f"joint_names: {json.dumps([names[c] for c in columns])}", "points:"
+    lines = [*head, *(f"- {point}" for point in _points(ticks, rows, columns))]
+    return "".join(f"{indent}{line}\n" for line in lines)
 
 
 def _from_messages(data: Mapping[str, Any]) -> tuple[Array, list[Array], tuple[str, ...]]:

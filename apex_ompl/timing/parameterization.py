@@ -20,8 +20,9 @@ from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.timing import ruckig_method, spline_method
 from apex_ompl.timing.curve import SAME_STATE, Polyline, deviation_bound
 from apex_ompl.timing.motion_limits import MotionLimits
-from apex_ompl.timing.ruckig_method import Profiles, from_moving_start, joined
-from apex_ompl.timing.trajectory import Extremes, Trajectory
+from apex_ompl.timing.ruckig_method import Profiles, from_moving_start
+from apex_ompl.timing.samples import Extremes
+from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import (
@@ -38,8 +39,8 @@ METHODS = MappingProxyType({"ruckig": ruckig_method.blended, "spline": spline_me
 """Methods by name.
 
 Each takes the polyline, the limits, the joint names, the allowed distance from the polyline [rad], a function that
-returns True to end the search, and limits of torques and tool speeds or None; it returns the trajectory and a bound on
-its distance from the polyline [rad], or None.
+returns True to end the search, and limits of torques and tool speeds or None; it returns the trajectory, a bound on its
+distance from the polyline [rad] and the name of what made it, or None.
 """
 DEFAULT_METHOD = "ruckig"
 
@@ -274,7 +275,7 @@ def time_path(
     if reason:
         raise TimingError(reason)
     for timed in _from_rest(line, scaled, tuple(joint_names), timing, stop=stop, more=motion_limits):
-        rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration))
+        rest = replace(timed, trajectory=_lasting(timed.trajectory, timing.minimum_duration).merged())
         for candidate in (
             [rest]
             if start is None
@@ -358,7 +359,7 @@ def _from_rest(
     motion = ruckig_method.stops(line, limits, joint_names, stop)
     if motion is None:
         return
-    stopping, factor = _slowed(TimedPath(*motion, "ruckig", "line" if straight else "stops"), more)
+    stopping, factor = _slowed(TimedPath(*motion, "line" if straight else "stops"), more)
     if straight and factor > SAME_DURATION:
         blended = _blended(line, limits, joint_names, "spline", timing.deviation, stop=stop, more=more)
         if blended is not None and blended.trajectory.duration < stopping.trajectory.duration:
@@ -381,7 +382,7 @@ def _blended(
             motion = METHODS[way](line, limits, joint_names, deviation, stop, more=rows)
             if motion is None:
                 break
-            timed, factor = _slowed(TimedPath(*motion, way, "blended"), more)
+            timed, factor = _slowed(TimedPath(*motion, "blended"), more)
             if fastest is None or timed.trajectory.duration * SAME_DURATION < fastest.trajectory.duration:
                 fastest = timed
             if factor <= SAME_DURATION:
@@ -468,7 +469,7 @@ def warm_up() -> None:
     arc_lengths(max_path_speeds(np.ones((3, 1)), np.zeros((3, 1)), np.ones(1), np.ones(1), 1.0), 1.0, 1.0, 1)
     max_distance(np.zeros((1, 1)), np.zeros(1), np.array([[0.0], [1.0]]), np.array([0.0, 1.0]), 1.0)
     still = Profiles(np.ones((1, 1, 1)), np.zeros((1, 1, 1)), np.ones(1), brakes=False)
-    motion = joined(still, np.zeros((3, 2, 1)), ("joint",))
+    motion = still.joined(np.zeros((3, 2, 1)), ("joint",))
     Trajectory(*motion.knots, ("joint",)).states(motion.times)
     Extremes.of(*motion.knots)
     cubic_rates(motion.knots)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple, Self
@@ -13,9 +14,11 @@ from apex_ompl.errors import TimingError
 from apex_ompl.kernel.timing import TICK, join_profiles
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.curve import Polyline, deviation_bound
+from apex_ompl.timing.knots import LEAST_SPANS, refitted, removable
 from apex_ompl.timing.motion_limits import MotionLimits
+from apex_ompl.timing.samples import Extremes
 from apex_ompl.timing.spline_method import blend
-from apex_ompl.timing.trajectory import ROUNDING, Trajectory, concatenate
+from apex_ompl.timing.trajectory import LEAST_SPACING, ROUNDING, Trajectory, joined
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import distinct
 
@@ -24,10 +27,21 @@ LIMITS_SHARE = 1.0 - 1e-6  # share of the limits that Ruckig is given, for its r
 JERK_SHARE = 1.0 - 1e-5  # share of the jerk limit, which leaves room for rounding
 LIMITS_MARGIN = 1.0 + 1e-10  # factor on the limits where the given states are at them
 STILL = 1e-12  # range of a joint that stays [rad]
-STRIDES = (2, 1)  # of the knots of a spline that Ruckig's motion goes through; the first that keeps the deviation
-SLOWEST = 1.02  # duration as a multiple of the guide's
 DERIVATIVES = ("velocity", "acceleration", "jerk")
 JOIN_TIMES = 12  # intervals of a motion at whose ends a moving start may join it
+SAME_PROBLEM = 0.01  # share of an acceleration limit by which neighboring spans of one problem may differ from a line
+JERK_MARGIN = 1e-4  # share by which the jerk limit of a problem is over the jerk of the given motion
+JERK_FLOORS = (1e-5, 1e-4)  # added to it, times the cubed duration of the problem: tried in turn [rad]
+FLOOR_SHARE = 0.01  # largest floor, as a share of the limit
+WINDOW = 0.2  # in which a motion with fewer knots meets the given one [s]
+WIDE = 2.0  # factor on the largest velocity and acceleration of a motion, for the limits of its problems
+SAME_DURATION = 1e-6  # relative difference of durations that count as one
+CALM_TIME = 1.005  # duration of a straight motion over the shortest one, for which its jerk is the least
+JERK_STEPS = 20  # of the bisection for the least jerk
+LEAST_JERK = 1e-3  # share of the limit, or of the largest jerk of a line, below which it is not lowered
+HEAD_SHARES = (1.0, 0.995, 0.98, 0.95)  # of the limits, for motions from a moving start, whose knots are merged
+HEAD_SPACINGS = (8e-3, LEAST_SPACING)  # of their knots, tried in turn [s]
+CALMER = (0.5, 0.25, 0.125, 0.0625)  # shares of the jerk limits that are tried for them
 
 
 def calculate(solver: ruckig.Ruckig, query: ruckig.InputParameter, solution: ruckig.Trajectory) -> None:
@@ -91,32 +105,27 @@ class Profiles(NamedTuple):
             jerks = np.concatenate([np.array([[brake.j for brake in row] for row in before]), jerks], axis=2)
         return cls(phases, jerks, durations, brakes)
 
+    def joined(self, states: Array, joint_names: tuple[str, ...]) -> Trajectory:
+        """Return consecutive motions as one trajectory that goes through given states exactly.
 
-def joined(profiles: Profiles, states: Array, joint_names: tuple[str, ...]) -> Trajectory:
-    """Return consecutive motions as one trajectory that goes through given states exactly.
+        Its knots are where the jerk of any joint changes.
 
-    Its knots are where the jerk of any joint changes.
-
-    Args:
-        profiles: The motions.
-        states: Positions, velocities and accelerations at their ends, shape (3, K + 1, dof).
-        joint_names: Names of the joints.
-    """
-    starts = np.round(np.cumsum([0.0, *profiles.durations]) / TICK).astype(np.int64)
-    return Trajectory.unchecked(*join_profiles(profiles.phases, profiles.jerks, starts, states), joint_names)
+        Args:
+            states: Positions, velocities and accelerations at their ends, shape (3, K + 1, dof).
+            joint_names: Names of the joints.
+        """
+        starts = np.round(np.cumsum([0.0, *self.durations]) / TICK).astype(np.int64)
+        return Trajectory.unchecked(*join_profiles(self.phases, self.jerks, starts, states), joint_names)
 
 
 def blended(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
     stop: Callable[[], bool] = lambda: False, *, more: MotionLimits | None = None,
-) -> tuple[Trajectory, float] | None:  # fmt: skip
+) -> tuple[Trajectory, float, str] | None:  # fmt: skip
     """Return Ruckig's motion along a polyline, its corners rounded.
 
-    The states of the fastest spline in time (:func:`apex_ompl.timing.spline_method.blend`) at every second knot
-    are targets of Ruckig's state-to-state problems in all joints, each with the time between its knots as the least
-    duration. The spline itself solves them within the limits, so that Ruckig's motion takes no longer but for rounding.
-    Where the motion leaves the polyline too far, or the position limits, which Ruckig ignores, or is slower (there may
-    be durations in which no motion between two states exists), all of the knots are targets.
+    It follows the fastest spline in time (:func:`apex_ompl.timing.spline_method.blend`) by :func:`calm`, where
+    neighboring spans become one state-to-state problem if the motion then keeps ``deviation``.
 
     Args:
         line: The polyline, of positive length.
@@ -127,80 +136,120 @@ def blended(
         more: Limits of torques and tool speeds, see :func:`apex_ompl.timing.spline_method.blend`.
 
     Returns:
-        The motion and a bound on its distance from the polyline [rad], or None where none keeps ``deviation``, or when
-        ``stop`` returned True.
+        The motion, a bound on its distance from the polyline [rad], and the name of the method
+        (:attr:`Calm.method`); or None where none keeps ``deviation``, or when ``stop`` returned True.
     """
-    room = {name: LIMITS_SHARE * getattr(limits, name) for name in ("velocity", "acceleration")}
-    guide = blend(line, replace(limits, **room), joint_names, deviation, stop, more=more)
+    guide = blend(line, limits, joint_names, deviation, stop, more=more)
     if guide is None:
         return None
-    knot_times, arc = guide.arc_at
-    for stride in STRIDES:
-        motion = through_knots(guide.trajectory, limits, stride, stop)
-        if motion is None or motion.use(limits)["position"] > 1.0 + ROUNDING:
-            continue
-        if motion.duration > SLOWEST * guide.trajectory.duration:
-            continue
-        times = knot_times * (motion.duration / guide.trajectory.duration)
-        bound = deviation_bound(motion, line, (times, arc), guide.window, deviation, stop=stop)
+    for tolerance in (SAME_PROBLEM, 0.0):
+        made = calm(guide.trajectory, limits, stop, tolerance)
+        if made is None:
+            return None
+        bound = guide.deviation
+        if made.problems < len(guide.trajectory.times) - 1:
+            bound = deviation_bound(made.trajectory, line, guide.arc_at, guide.window, deviation, stop=stop)
         if bound <= deviation:
-            return motion, bound
+            return made.trajectory, bound, made.method
     return None
 
 
-def through_knots(
-    guide: Trajectory, limits: Limits, stride: int, stop: Callable[[], bool] = lambda: False
-) -> Trajectory | None:
-    """Return Ruckig's motion through every ``stride``-th knot of another motion, in its time.
+class Calm(NamedTuple):
+    """A motion by Ruckig at the least jerks.
+
+    Attributes:
+        trajectory: The motion.
+        problems: Number of its state-to-state problems.
+        solved: How many of them Ruckig solved; in the others the motion is the given one.
+    """
+
+    trajectory: Trajectory
+    problems: int
+    solved: int
+
+    @property
+    def method(self) -> str:
+        """Name of the method: ``ruckig``, with the number of problems where it did not solve all of them."""
+        return "ruckig" if self.solved == self.problems else f"ruckig in {self.solved} of {self.problems} spans"
+
+
+def calm(
+    motion: Trajectory, limits: Limits, stop: Callable[[], bool] = lambda: False, tolerance: float = SAME_PROBLEM
+) -> Calm | None:
+    """Return Ruckig's motion that follows a spline in time at the least jerk of each joint.
+
+    1. Neighboring spans in which the accelerations of all joints are nearly on a line become one state-to-state
+       problem, where the motion with fewer knots keeps the limits.
+    2. In each problem, of duration h, the jerk limit of each joint is a little over its jerk J on the way: |J| + d.
+       Ruckig's motion between the states at both ends has this duration and keeps that limit. So its accelerations are
+       within d h and its positions within d h^3 / 4 of those with the constant jerk J, some microradians.
+    3. But for one, its phases last microseconds. They are merged into that one, so that the knots are the ends of the
+       problems.
+
+    Where Ruckig finds no motion of the duration h, the given motion is kept.
 
     Args:
-        guide: Motion within the limits.
+        motion: Motion of constant jerk between knots, within the limits.
         limits: Limits of the joints.
-        stride: Of the knots; the ends are among them.
         stop: Called before every state-to-state problem; True ends the search.
+        tolerance: Distance from the line, as a share of the acceleration limits; with 0 every span is a problem.
 
     Returns:
-        The motion, or None where Ruckig finds none or ``stop`` returned True.
+        The motion, which takes as long as the given one and has the same ends; or None when ``stop`` returned True.
     """
-    chosen = distinct([*range(0, len(guide.times), stride), len(guide.times) - 1])
-    solver, query = ruckig.Ruckig(guide.dof), ruckig.InputParameter(guide.dof)
-    for name, share in zip(DERIVATIVES, (LIMITS_MARGIN, LIMITS_MARGIN, JERK_SHARE), strict=True):
-        setattr(query, f"max_{name}", (share * getattr(limits, name)).tolist())
-    states = np.stack([guide.positions[chosen], guide.velocities[chosen], guide.accelerations[chosen]])
-    still = np.ptp(guide.positions, axis=0) <= STILL  # up to rounding, which Ruckig would follow
-    states[0][:, still], states[1:, :, still] = guide.positions[0, still], 0.0
-    rows = states.tolist()
-    solutions = []
-    for k, least in enumerate(np.diff(guide.times[chosen]).tolist()):
+    motion = _fewer_problems(motion.merged(), limits, tolerance) if tolerance else motion.merged()
+    if len(motion.times) == 1:
+        return Calm(motion, 0, 0)
+    solver, query = ruckig.Ruckig(motion.dof), ruckig.InputParameter(motion.dof)
+    solution = ruckig.Trajectory(motion.dof)
+    lengths = np.diff(motion.times)
+    states = np.stack([motion.positions, motion.velocities, motion.accelerations])
+    still = np.ptp(motion.positions, axis=0) <= STILL  # up to rounding, which Ruckig would follow
+    states[0][:, still], states[1:, :, still] = motion.positions[0, still], 0.0
+    cubed = lengths[:, None] ** 3
+    floors = [np.minimum(floor / cubed, FLOOR_SHARE * limits.jerk) for floor in JERK_FLOORS]
+    jerks = [((1.0 + JERK_MARGIN) * np.abs(motion.jerks) + floor).tolist() for floor in floors]
+    largest = np.abs(states[2]).max(axis=0)
+    query.max_acceleration = (WIDE * largest + limits.acceleration).tolist()
+    reach = largest**2 / np.min([floor.min(axis=0) for floor in floors], axis=0)  # reached at such a jerk
+    query.max_velocity = (WIDE * np.abs(states[1]).max(axis=0) + limits.velocity + reach).tolist()
+    rows, solved = states.tolist(), 0
+    for k, length in enumerate(lengths.tolist()):
         if stop():
             return None
         query.current_position, query.current_velocity, query.current_acceleration = (values[k] for values in rows)
         query.target_position, query.target_velocity, query.target_acceleration = (values[k + 1] for values in rows)
-        query.minimum_duration = least
-        solution = ruckig.Trajectory(guide.dof)
-        try:
-            calculate(solver, query, solution)
-        except ruckig.RuckigError:
-            return None
-        solutions.append(solution)
-    profiles = Profiles.of(solutions)
-    return None if profiles.brakes else _within(joined(profiles, states, guide.joint_names), limits)
+        query.minimum_duration = length
+        for limit in jerks:
+            query.max_jerk = limit[k]
+            try:
+                calculate(solver, query, solution)
+            except ruckig.RuckigError:
+                continue
+            if abs(solution.duration - length) <= SAME_DURATION * length:
+                solved += 1
+                break
+    return Calm(motion, len(lengths), solved)
 
 
-def _within(motion: Trajectory, limits: Limits) -> Trajectory:
-    """Return a motion slowed down until rounding takes it over no limit."""
-    use = motion.use(limits)
-    over = max(use[name] ** (1.0 / order) for order, name in enumerate(DERIVATIVES, 1))
-    return motion if over <= 1.0 else motion.slower(over * (1.0 + ROUNDING))
+def _fewer_problems(motion: Trajectory, limits: Limits, tolerance: float) -> Trajectory:
+    """Return a motion without the knots that are in the middle of one problem, where it keeps the limits."""
+    removed = removable(motion.accelerations, motion.times, tolerance * limits.acceleration)
+    if not removed.any() or len(motion.times) - removed.sum() <= LEAST_SPANS:
+        return motion
+    times = motion.times[~removed]
+    states = refitted(motion.states(times), times, WINDOW)
+    fewer = Trajectory.unchecked(times, states, motion.joint_names)
+    return fewer if max(fewer.use(limits).values()) <= 1.0 + ROUNDING else motion
 
 
 def stops(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], stop: Callable[[], bool] = lambda: False
-) -> tuple[Trajectory, float] | None:
-    """Return the fastest motion from corner to corner of a polyline, at rest at each.
+) -> tuple[Trajectory, float, str] | None:
+    """Return the motion from corner to corner of a polyline, at rest at each.
 
     Along each straight line the arc length moves by Ruckig, within the tightest of the joints' limits divided by the
-    joints' share of the direction.
+    joints' share of the direction, at the least jerk that takes 0.5 % longer than the largest one.
 
     Args:
         line: The polyline, of positive length.
@@ -209,35 +258,104 @@ def stops(
         stop: Called at every corner; True ends the search.
 
     Returns:
-        The motion and its largest distance from the polyline [rad], or None when ``stop`` returned True.
+        The motion, its largest distance from the polyline [rad], and ``ruckig``; or None when ``stop`` returned True.
 
     Raises:
         TimingError: Ruckig finds no motion.
     """
     corners = line.corners()
     parts = []
-    solver, query, solution = ruckig.Ruckig(1), ruckig.InputParameter(1), ruckig.Trajectory(1)
     for start, end in zip(corners.states[:-1], corners.states[1:], strict=True):
         if stop():
             return None
         length = float(np.linalg.norm(end - start))
         direction = (end - start) / length
         moves = np.abs(direction) > 1e-12
-        query.target_position = [length]
-        for name in DERIVATIVES:
-            limit = LIMITS_SHARE * np.min(getattr(limits, name)[moves] / np.abs(direction[moves]))
-            setattr(query, f"max_{name}", [float(limit)])
+        along = [float(np.min(getattr(limits, name)[moves] / np.abs(direction[moves]))) for name in DERIVATIVES]
+        arc = _along_line(length, *along)
+        positions = start + arc.positions * direction
+        positions[0], positions[-1] = start, end
+        parts.append(
+            Trajectory(arc.times, positions, arc.velocities * direction, arc.accelerations * direction, joint_names)
+        )
+    deviation = float(np.linalg.norm(line.states - corners.at(line.arc), axis=1).max())
+    return joined(parts), deviation, "ruckig"
+
+
+def _along_line(length: float, velocity: float, acceleration: float, jerk: float) -> Trajectory:
+    """Return the motion of the arc length along a straight line, from rest to rest, with merged knots.
+
+    Args:
+        length: Of the line [rad].
+        velocity: Limit along the line [rad/s].
+        acceleration: Limit [rad/s^2].
+        jerk: Limit [rad/s^3].
+
+    Raises:
+        TimingError: Ruckig finds no motion.
+    """
+    solver, query, solution = ruckig.Ruckig(1), ruckig.InputParameter(1), ruckig.Trajectory(1)
+    query.target_position = [length]
+    share = LIMITS_SHARE
+    while True:
+        bounds = share * velocity, share * acceleration, least_jerk(length, velocity, acceleration, share * jerk)
+        for name, bound in zip(DERIVATIVES, bounds, strict=True):
+            setattr(query, f"max_{name}", [bound])
         try:
             calculate(solver, query, solution)
         except ruckig.RuckigError as error:
-            limit = ", ".join(f"{name} {getattr(query, f'max_{name}')[0]:.3g}" for name in DERIVATIVES)
-            raise TimingError(f"Ruckig finds no motion along a line of {length:.3g} rad within {limit}") from error
-        times, arc, speed, acceleration = knots(solution)
-        positions = start + arc * direction
-        positions[0], positions[-1] = start, end
-        speed[[0, -1]], acceleration[[0, -1]] = 0.0, 0.0  # without rounding
-        parts.append(Trajectory(times, positions, speed * direction, acceleration * direction, joint_names))
-    return concatenate(parts), float(np.linalg.norm(line.states - corners.at(line.arc), axis=1).max())
+            shown = ", ".join(f"{name} {bound:.3g}" for name, bound in zip(DERIVATIVES, bounds, strict=True))
+            raise TimingError(f"Ruckig finds no motion along a line of {length:.3g} rad within {shown}") from error
+        times, *states = knots(solution)
+        states[1][[0, -1]], states[2][[0, -1]] = 0.0, 0.0  # without rounding
+        motion = Trajectory.unchecked(times, np.stack(states), ("arc",)).merged()
+        *_, v, a, j = Extremes.of(*motion.knots)
+        over = max(v[0] / velocity, a[0] / acceleration, j[0] / jerk)
+        if over <= 1.0:
+            return motion
+        share *= LIMITS_SHARE / over
+
+
+def least_jerk(length: float, velocity: float, acceleration: float, jerk: float) -> float:
+    """Return the least jerk with which a straight motion from rest to rest takes 0.5 % longer than at the limit.
+
+    With the ramps of the acceleration at least ``LEAST_SPACING`` long, it may take longer than that.
+
+    Args:
+        length: Of the line [rad].
+        velocity: Limit along the line [rad/s].
+        acceleration: Limit [rad/s^2].
+        jerk: Limit [rad/s^3].
+    """
+    ramp = LEAST_SPACING
+    high = min(jerk, acceleration / ramp, velocity / ramp**2, length / (2.0 * ramp**3))
+    allowed = CALM_TIME * line_duration(length, velocity, acceleration, jerk)
+    low = LEAST_JERK * high
+    for _ in range(JERK_STEPS):
+        middle = math.sqrt(low * high)
+        if line_duration(length, velocity, acceleration, middle) <= allowed:
+            high = middle
+        else:
+            low = middle
+    return high
+
+
+def line_duration(length: float, velocity: float, acceleration: float, jerk: float) -> float:
+    """Return the least duration of a straight motion from rest to rest (Biagiotti and Melchiorri 2008, 3.4) [s].
+
+    Args:
+        length: Of the line [rad].
+        velocity: Limit along the line [rad/s].
+        acceleration: Limit [rad/s^2].
+        jerk: Limit [rad/s^3].
+    """
+    rise = acceleration / jerk
+    ramp = velocity / acceleration + rise if velocity >= acceleration * rise else 2.0 * math.sqrt(velocity / jerk)
+    if length >= velocity * ramp:
+        return length / velocity + ramp
+    if length >= 2.0 * acceleration * rise**2:
+        return rise + math.sqrt(rise**2 + 4.0 * length / acceleration)
+    return 4.0 * math.cbrt(length / (2.0 * jerk))
 
 
 def from_moving_start(
@@ -252,18 +370,51 @@ def from_moving_start(
         limits: Limits of the joints.
         minimum_duration: Least duration of the whole motion [s].
     """
-    for time in np.linspace(0.0, motion.duration, JOIN_TIMES + 1) if motion.duration else [0.0]:
+    chosen = np.searchsorted(motion.times, np.linspace(0.0, motion.duration, JOIN_TIMES + 1)[:-1])
+    for k in [*distinct(chosen).tolist(), len(motion.times) - 1]:
+        time = float(motion.times[k])
         left = motion.duration - time
         now = np.stack([motion.positions[0], velocity, acceleration])
         states = np.stack([now, motion.states(np.array([time]))[:, 0]], axis=1)
-        head = between(states, limits, motion.joint_names, minimum_duration - left)
+        head = _calm_head(states, limits, motion.joint_names, minimum_duration - left, (CALM_TIME - 1.0) * left)
         if head is not None:
-            yield concatenate([head, motion.after(time)]), head.duration
+            yield joined([head, motion.after(time)]), head.duration
+
+
+def _calm_head(
+    states: Array, limits: Limits, joint_names: tuple[str, ...], minimum_duration: float, longer: float
+) -> Trajectory | None:
+    """Return a motion between two states with merged knots, as calm as a somewhat longer duration allows, or None.
+
+    Args:
+        states: Positions, velocities and accelerations at start and end, shape (3, 2, dof).
+        limits: Limits of the joints.
+        joint_names: Names of the joints.
+        minimum_duration: Least duration [s].
+        longer: Time by which it may be longer, in addition to 0.5 % of its own [s].
+    """
+    for share in HEAD_SHARES:
+        room = replace(limits, **{name: share * getattr(limits, name) for name in DERIVATIVES})
+        made = between(states, room, joint_names, minimum_duration, limits)
+        if made is None:
+            continue
+        allowed = CALM_TIME * made.duration + longer
+        for calmer in CALMER:
+            other = between(states, replace(room, jerk=calmer * room.jerk), joint_names, minimum_duration, limits)
+            if other is None or other.duration > allowed:
+                break
+            made = other
+        for spacing in HEAD_SPACINGS:
+            merged = made.merged(spacing)
+            if max(merged.use(limits).values()) <= 1.0 + ROUNDING:
+                return merged
+    return None
 
 
 def between(
-    states: Array, limits: Limits, joint_names: tuple[str, ...], minimum_duration: float = 0.0
-) -> Trajectory | None:
+    states: Array, limits: Limits, joint_names: tuple[str, ...], minimum_duration: float = 0.0,
+    outer: Limits | None = None,
+) -> Trajectory | None:  # fmt: skip
     """Return Ruckig's motion between two states, the fastest in which all joints arrive together, or None.
 
     Args:
@@ -271,9 +422,10 @@ def between(
         limits: Limits of the joints. Ruckig ignores position limits; a motion beyond them is not returned.
         joint_names: Names of the joints.
         minimum_duration: Least duration [s].
+        outer: Limits that the motion is checked for, where ``limits`` are lower than those of the given states.
     """
     solution = _solved(states, limits, minimum_duration)
-    return None if solution is None else _within_limits([solution], states, limits, joint_names)
+    return None if solution is None else _within_limits([solution], states, outer or limits, joint_names)
 
 
 def through(
@@ -323,5 +475,5 @@ def _within_limits(
     solutions: list[ruckig.Trajectory], states: Array, limits: Limits, joint_names: tuple[str, ...]
 ) -> Trajectory | None:
     """Return solutions as one motion if it keeps the limits; Ruckig may exceed a limit that a velocity is near."""
-    made = joined(Profiles.of(solutions), states, joint_names)
+    made = Profiles.of(solutions).joined(states, joint_names)
     return made if max(made.use(limits).values()) <= 1.0 + ROUNDING else None

@@ -1,17 +1,23 @@
-"""Smoothness of paths and motions: root mean square jerk, and spectral arc length.
+"""Smoothness of paths and motions: root mean square jerk, pulses of the acceleration, and spectral arc length.
 
 The smoothness S_r of the paper, the sum of joint-space steps, is :func:`apex_ompl.paths.path.path_length`.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple, Self
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.paths.path import resample
+from apex_ompl.robot.model import Limits
+from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_path, check_positive, number_array
 
+PULSE_SHARE = 0.3  # of the acceleration limit, above which there is a pulse
+SHORTEST = 1e-9  # duration that a motion counts for at least [s]
 STEPS = 128  # of even length that a path is resampled to for its jerk
 
 
@@ -32,6 +38,49 @@ def jerk(path: ArrayLike, duration: float = 1.0) -> float:
     check_positive(duration, "duration", "a positive number of seconds")
     third = np.diff(resample(states, STEPS + 1), 3, axis=0) * (STEPS / duration) ** 3
     return float(np.sqrt((third**2).sum(axis=1).mean()))
+
+
+class Smoothness(NamedTuple):
+    """How restless the joints of a motion are.
+
+    Attributes:
+        pulses: Pulses of the acceleration a second, shape (dof,) [1/s].
+        jerk: Root mean square over time of the jerk, as a share of its limit, shape (dof,).
+    """
+
+    pulses: Array
+    jerk: Array
+
+    @classmethod
+    def of(cls, times: Array, accelerations: Array, limits: Limits, share: float = PULSE_SHARE) -> Self:
+        """Return that of a motion with constant jerk between knots.
+
+        Args:
+            times: Of the knots, shape (K,) [s].
+            accelerations: At the knots, shape (K, dof) [rad/s^2].
+            limits: Limits of the joints.
+            share: Share of the acceleration limit above which there is a pulse.
+        """
+        gaps, changes = np.diff(times), np.diff(accelerations, axis=0)
+        duration = max(float(times[-1]), SHORTEST)
+        squares = (changes**2 / gaps[:, None]).sum(axis=0)
+        pulses = count_pulses(accelerations, share * limits.acceleration) / duration
+        return cls(pulses, np.sqrt(squares / duration) / limits.jerk)
+
+
+def count_pulses(accelerations: Array, thresholds: Array) -> NDArray[np.intp]:
+    """Return how often the acceleration of each joint is over a threshold, shape (dof,).
+
+    A pulse is a maximal interval in which |a| is over it.
+
+    Args:
+        accelerations: At the knots of a motion, linear in between, shape (K, dof) [rad/s^2].
+        thresholds: Shape (dof,) [rad/s^2].
+    """
+    side = np.where(np.abs(accelerations) > thresholds, np.sign(accelerations), 0.0)
+    before = np.concatenate([np.zeros_like(side[:1]), side[:-1]])
+    found: NDArray[np.intp] = np.count_nonzero((side != 0.0) & (side != before), axis=0)
+    return found
 
 
 def spectral_arc_length(

@@ -19,8 +19,8 @@ from apex_ompl.types import Array
 GRID_POINTS_PER_SPAN = 10
 MAX_SPANS = 20_000
 CONTROL_POINT_SPACING = 3.0  # of the curve, as a multiple of the deviation: a corner is cut by a third of the spacing
-KNOT_SPACINGS = tuple(0.001 * k * 2**n for n in range(2, 13) for k in (1, 1.5))  # in time, from 0.004 to 6.144 [s]
-FIRST_SPACING = 4  # index of the knot spacing that is tried first
+KNOT_SPACINGS = tuple(k * 2**n / 240 for n in range(11) for k in (1, 1.5))  # in time, from 0.0042 to 6.4 [s]
+FIRST_SPACING = 4  # index of the knot spacing that is tried first; smaller ones where they keep the deviation
 SAME_DURATION = 1.0005  # ratio of durations below which the motion with fewer knots is preferred
 NANOSECOND = 1e-9
 
@@ -45,10 +45,10 @@ class Blend(NamedTuple):
 def blended(
     line: Polyline, limits: Limits, joint_names: tuple[str, ...], deviation: float,
     stop: Callable[[], bool] = lambda: False, *, more: MotionLimits | None = None,
-) -> tuple[Trajectory, float] | None:  # fmt: skip
-    """Return the motion of :func:`blend` and the bound on its distance from the polyline [rad], or None."""
+) -> tuple[Trajectory, float, str] | None:  # fmt: skip
+    """Return the motion of :func:`blend`, a bound on its distance from the polyline [rad], and ``spline``, or None."""
     found = blend(line, limits, joint_names, deviation, stop, more=more)
-    return None if found is None else (found.trajectory, found.deviation)
+    return None if found is None else (found.trajectory, found.deviation, "spline")
 
 
 def blend(
@@ -110,8 +110,6 @@ def blend(
         not stop() and best + 1 < len(KNOT_SPACINGS) and duration_with(best + 1) < SAME_DURATION * duration_with(best)
     ):
         best += 1
-    while not stop() and best > 0 and duration_with(best - 1) * SAME_DURATION < duration_with(best):
-        best -= 1
     for index in range(best, -1, -1):  # knots far apart in time cut corners of the curve
         if stop():
             return None

@@ -6,80 +6,46 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.kernel.timing import motion_extremes, relative_gap, sample_motion
+from apex_ompl.kernel.moving import LimitArrays, stop_joints, stop_on_path
+from apex_ompl.kernel.timing import relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing.files import STATES, SUFFIXES, decode, encode
-from apex_ompl.timing.smoothness import spectral_arc_length
-from apex_ompl.types import Array, Flags
-from apex_ompl.util.display import counted, fields_line, html_table, one_line
+from apex_ompl.timing.files import NANOSECONDS, STATES, SUFFIXES, decode, encode
+from apex_ompl.timing.knots import LEAST_SPANS, even_times, is_on_grid, refitted, spaced
+from apex_ompl.timing.samples import Extremes, Sample
+from apex_ompl.timing.smoothness import PULSE_SHARE, Smoothness, spectral_arc_length
+from apex_ompl.types import Array
+from apex_ompl.util.display import counted, html_table, one_line
 from apex_ompl.util.files import path_text, suffix_of, write_atomically
-from apex_ompl.util.validation import check_array, check_integer, check_positive, check_times, finite_array
+from apex_ompl.util.validation import (
+    check_array,
+    check_integer,
+    check_number,
+    check_positive,
+    check_times,
+    finite_array,
+)
 
 ROUNDING = 1e-9  # of the used share of a limit
 CONTINUITY_TOLERANCE = 1e-6  # relative error of a knot integrated from the one before; files of ROS round times
 MAX_SAMPLES = 10**7
 BLOCK = 1000  # samples of a stream that are computed at once
 SPEED_SPACING, MAX_SPEED_SAMPLES = 0.001, 2**15  # of the speed profile for the spectral arc length [s]
-AT_REST = 1e-6
-"""Largest velocity of a joint at rest [rad/s]."""
-
-
-class Extremes(NamedTuple):
-    """Least and largest positions, largest velocities, accelerations and jerks of a motion, each of shape (dof,).
-
-    Jerks are lower bounds within the rounding of the knots. Knots of different joints may be 1e-10 s apart, and there
-    the rounding of times and accelerations alone changes a jerk by 1e-6 of it and more.
-    """
-
-    low: Array
-    high: Array
-    velocity: Array
-    acceleration: Array
-    jerk: Array
-
-    @classmethod
-    def of(cls, times: Array, positions: Array, velocities: Array, accelerations: Array) -> Self:
-        """Return the extremes of a motion: :func:`apex_ompl.kernel.timing.motion_extremes`.
-
-        Args:
-            times: Times of the knots, shape (K,) [s].
-            positions: At the knots, shape (K, dof).
-            velocities: At the knots, shape (K, dof).
-            accelerations: At the knots, shape (K, dof).
-        """
-        return cls(*motion_extremes((times, positions, velocities, accelerations)))
-
-    def slower(self, factor: float) -> Self:
-        """Return the extremes of the same motion in a time that is ``factor`` times as long."""
-        rest = self.velocity / factor, self.acceleration / factor**2, self.jerk / factor**3
-        return type(self)(self.low, self.high, *rest)
-
-
-class Sample(NamedTuple):
-    """State of a trajectory at one time, or at several.
-
-    Attributes:
-        time: Time since the start, a number or shape (N,) [s].
-        position: Shape (..., dof) [rad; synergies 0..1].
-        velocity: Shape (..., dof) [rad/s].
-        acceleration: Shape (..., dof) [rad/s^2].
-    """
-
-    time: float | Array
-    position: Array
-    velocity: Array
-    acceleration: Array
-
-    def __repr__(self) -> str:
-        """Return the time and the shapes of the rest."""
-        return fields_line(self)
+LEAST_SPACING = 1e-3
+"""Least time between knots for a controller [s]."""
+LIMIT_ROOM = 9e-4  # share by which a motion with other knots may exceed a limit; 1e-3 with the rounding in files
+WINDOWS = (0.1, 0.2, 0.4)  # of a motion with other knots, at whose ends it has the same state [s]
+NO_RATE = np.array([[1e-6], [1e-4], [1e-1]])  # velocity, acceleration and jerk that count as none [rad/s^k]
+RATES = (10, 20, 25, 40, 50, 100, 125, 200, 250, 400, 500, 1000)  # that are offered [Hz]
+SAME_STATE = 1e-6  # largest difference of states where motions are joined [rad/s^k]
+STOP_DEVIATION = 1e-3  # of a stop from the path [rad]
+STOP_SHARES = (1.0, 0.99, 0.97, 0.9)  # of the limits, for a stop joint by joint whose knots are merged
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +233,15 @@ class Trajectory:
         squares = np.sum(self.jerks**2, axis=1)
         return float(np.sqrt(squares @ np.diff(self.times) / self.duration))
 
+    def smoothness(self, limits: Limits, share: float = PULSE_SHARE) -> Smoothness:
+        """Return pulses of the acceleration a second, and the root mean square jerk as a share of the limit, by joint.
+
+        Args:
+            limits: Limits of the joints.
+            share: Share of the acceleration limit above which there is a pulse.
+        """
+        return Smoothness.of(self.times, self.accelerations, limits, share)
+
     @property
     def spectral_arc_length(self) -> float:
         """Spectral arc length of the speed |q'|, nearer to 0 for smoother motions; 0 for one without motion."""
@@ -287,6 +262,154 @@ class Trajectory:
             slow.__dict__["_extremes"] = self._extremes.slower(factor)
         return slow
 
+    def merged(self, spacing: float = LEAST_SPACING) -> Trajectory:
+        """Return the motion with knots at whole nanoseconds, at least ``spacing`` apart [s]; itself where they are so.
+
+        Of knots that are nearer to each other one is kept, and the accelerations are corrected for it
+        (:mod:`apex_ompl.timing.knots`). Both ends are exact. Velocities, accelerations and jerks may be larger by some
+        1e-4 of the largest. A motion shorter than eight spacings gets proportionally nearer knots.
+
+        Raises:
+            ParameterError: ``spacing`` is not a positive number, or the motion takes a few nanoseconds only.
+        """
+        check_positive(spacing, "spacing", "a positive number of seconds")
+        gaps = np.diff(self.times)
+        if 0.0 < self.duration * NANOSECONDS < 4 * LEAST_SPANS:
+            raise ParameterError("duration", self.duration, f"at least {4 * LEAST_SPANS} ns, for four spans of time")
+        spacing = min(spacing, self.duration / (2 * LEAST_SPANS))
+        if not gaps.size or (gaps.min() >= spacing * (1.0 - 1e-6) and is_on_grid(self.times)):
+            return self
+        return self._at_knots(spaced(self.times, spacing), self._extremes.rates)[0]
+
+    def resampled(self, rate: float, limits: Limits | None = None) -> Trajectory:
+        """Return the motion with knots at a rate, and at its end; the jerk is constant between them.
+
+        It is another motion, which has the same state as this one every 0.1 to 0.4 s. In between it is, for motions of
+        two Pandas, some 0.1 mrad from it at 100 Hz and 0.01 mrad at 250 Hz; :meth:`deviation` tells. Both ends are
+        exact. Velocities, accelerations and jerks are at most 1e-3 over the limits. The end is one to two spacings from
+        the knot before it.
+
+        Args:
+            rate: Knots a second [Hz].
+            limits: Limits of the joints; by default the largest rates of each joint.
+
+        Raises:
+            ParameterError: The rate is too low for that; the lowest one that is not is named.
+        """
+        check_positive(rate, "rate", "a positive number of samples a second")
+        if not self.duration:
+            return self
+        if rate * self.duration > MAX_SAMPLES or rate > 1.0 / LEAST_SPACING:
+            raise ParameterError("rate", rate, f"at most {1.0 / LEAST_SPACING:g} Hz")
+        bounds = (
+            self._extremes.rates if limits is None else np.stack([limits.velocity, limits.acceleration, limits.jerk])
+        )
+        made, excess = self._at_knots(even_times(self.duration, rate), bounds)
+        if excess <= LIMIT_ROOM:
+            return made
+        for higher in RATES:
+            if higher > rate and self._at_knots(even_times(self.duration, higher), bounds)[1] <= LIMIT_ROOM:
+                raise ParameterError("rate", rate, f"at least {higher} Hz, at which this motion keeps its limits")
+        raise ParameterError("rate", rate, "none: the motion keeps its limits with its own knots only")
+
+    def _at_knots(self, times: Array, bounds: Array) -> tuple[Trajectory, float]:
+        """Return the motion with other knots, and by which share it exceeds bounds of the rates, shape (3, dof)."""
+        states = self.states(times)
+        for k in (0, -1):
+            states[:, k] = self.positions[k], self.velocities[k], self.accelerations[k]
+        best, least = self, np.inf
+        for window in WINDOWS:
+            made = Trajectory.unchecked(times, refitted(states, times, window), self.joint_names)
+            excess = float(((made._extremes.rates - bounds) / np.maximum(bounds, NO_RATE)).max())
+            if excess < least:
+                best, least = made, excess
+            if excess <= LIMIT_ROOM or self.duration <= window:
+                break
+        return best, least
+
+    def deviation(self, other: Trajectory) -> float:
+        """Return the largest distance of any joint from another motion of the same joints at the same time [rad].
+
+        Raises:
+            ParameterError: The motions are of other joints.
+        """
+        if self.joint_names != other.joint_names:
+            raise ParameterError("other", ", ".join(other.joint_names), f"the joints {', '.join(self.joint_names)}")
+        times = np.sort(np.concatenate([self.times, other.times]))
+        times = times[np.append(True, np.diff(times) > 1.0 / NANOSECONDS)]
+        low, high, *_ = Extremes.of(times, *(self.states(times) - other.states(times)))
+        return float(np.maximum(-low, high).max())
+
+    def selected(self, joints: Sequence[str]) -> Trajectory:
+        """Return the motion of some of the joints, in their order.
+
+        Raises:
+            ParameterError: No joint, an unknown one, or one given twice.
+        """
+        known = list(self.joint_names)
+        names = [] if isinstance(joints, str) else [str(joint) for joint in joints]
+        if not names or len(set(names)) < len(names) or not set(names) <= set(known):
+            raise ParameterError("joints", joints, f"some of the joints {', '.join(known)}, each once")
+        columns = [known.index(name) for name in names]
+        states = np.array([[row[columns] for row in getattr(self, name)] for name in STATES])
+        return Trajectory.unchecked(self.times, states, tuple(names))
+
+    def before(self, time: float) -> Trajectory:
+        """Return the motion up to a time [s].
+
+        Raises:
+            ParameterError: ``time`` is not a finite number.
+        """
+        end = float(np.clip(finite_array(time, "time"), 0.0, self.duration))
+        earlier = self.times < end - 1.0 / NANOSECONDS
+        times = np.append(self.times[earlier], end) if earlier.any() else np.zeros(1)
+        q, v, a = self.states(times)
+        return Trajectory(times, q, v, a, self.joint_names)
+
+    def stop_at(self, time: float, limits: Limits) -> Trajectory:
+        """Return the motion up to a time, and then the soonest stop within the limits.
+
+        The stop slows down along the path, at most a millirad from it
+        (:func:`apex_ompl.kernel.moving.stop_on_path`); where it cannot, as the motion does not end at rest, each joint
+        stops by itself (:func:`apex_ompl.kernel.moving.stop_joints`). Where no stop is sooner than the end of the
+        motion, it is the motion itself. :func:`joined` adds a motion that goes on.
+
+        Args:
+            time: Time at which the robot starts to slow down [s].
+            limits: Limits of the joints, which the motion keeps.
+
+        Raises:
+            ParameterError: ``time`` is not within the motion, or the motion is over a limit, or a joint cannot stop
+                before its position limit.
+        """
+        check_number(time, "time", 0.0, self.duration)
+        for name, share in self.use(limits).items():
+            if share > 1.0 + LIMIT_ROOM:
+                raise ParameterError("limits", f"{share:.4g} of the {name} limit is used", "limits the motion keeps")
+        if self.velocities[-1].any() or self.accelerations[-1].any():
+            return self._joint_stop(time, limits)
+        found = stop_on_path(
+            self.times, np.stack([self.positions, self.velocities, self.accelerations]), time, LimitArrays.of(limits),
+            STOP_DEVIATION,
+        )  # fmt: skip
+        if found is None:
+            return self
+        return joined([self.before(time), Trajectory.unchecked(found[0], found[1], self.joint_names)]).merged()
+
+    def _joint_stop(self, time: float, limits: Limits) -> Trajectory:
+        """Return the motion up to a time, and then the soonest stop of each joint by itself."""
+        head, made = self.before(time), self
+        bounds, now = LimitArrays.of(limits), self.states(np.array([time]))[:, 0]
+        for share in STOP_SHARES:  # with room for the merging
+            room = bounds._replace(acceleration=share * bounds.acceleration, jerk=share * bounds.jerk)
+            times, knots, beyond = stop_joints(now[0], now[1], now[2], room)
+            if beyond.any():
+                break
+            made = joined([head, Trajectory.unchecked(times.copy(), knots.copy(), self.joint_names)]).merged()
+            if max(made.use(limits).values()) <= 1.0 + LIMIT_ROOM:
+                return made
+        raise ParameterError("time", time, "one from which each joint can stop within its limits")
+
     def after(self, time: float) -> Trajectory:
         """Return the rest of the motion from a time on [s].
 
@@ -303,23 +426,53 @@ class Trajectory:
         q, v, a = (np.concatenate([here, values[later]]) for here, values in zip(now, knots, strict=True))
         return Trajectory(np.append(0.0, self.times[later] - time), q, v, a, self.joint_names)
 
-    def save(self, path: str | os.PathLike[str], controllers: Mapping[str, Sequence[str]] | None = None) -> None:
+    def saved(
+        self, *, rate: float | None = None, joints: Sequence[str] | None = None, limits: Limits | None = None
+    ) -> Trajectory:
+        """Return the motion that :meth:`save` writes, for proofs.
+
+        It is what a controller makes of the file: polynomials of fifth degree through positions, velocities and
+        accelerations of two neighboring knots are of third degree here. Only the numbers in the file are rounded
+        (except in ``.npz``), which moves it by less than a nanoradian (:data:`apex_ompl.timing.files.DECIMALS`).
+
+        Args:
+            rate: Knots a second (:meth:`resampled`); by default the motion's own (:meth:`merged`) [Hz].
+            joints: Joints in their order; by default all.
+            limits: Limits of all joints, for :meth:`resampled`.
+
+        Raises:
+            ParameterError: The rate is too low for the motion, or the joints are not some of its own.
+        """
+        motion = self.merged() if rate is None else self.resampled(rate, limits)
+        return motion if joints is None else motion.selected(joints)
+
+    def save(
+        self, path: str | os.PathLike[str], controllers: Mapping[str, Sequence[str]] | None = None, *,
+        rate: float | None = None, joints: Sequence[str] | None = None, limits: Limits | None = None,
+    ) -> None:  # fmt: skip
         """Write the motion by the suffix of ``path``; :meth:`load` reads it back.
 
         ``.npz`` holds the knots; ``.csv`` a row for each, under a header of joint names; ``.traj.yaml`` and
-        ``.traj.json`` a ``trajectory_msgs/JointTrajectory`` of ROS 2, whose times are whole nanoseconds.
+        ``.traj.json`` a ``trajectory_msgs/JointTrajectory`` of ROS 2. All times are whole nanoseconds.
 
         Args:
             path: The file.
             controllers: Joints by the name of their controller; the file then has one message for each, by name.
+            rate: Knots a second, and one at the end; by default the motion's own, at least 1 ms apart [Hz].
+            joints: Joints in their order; by default all.
+            limits: Limits of all joints that the motion at that rate must keep to 1e-3; by default the largest
+                velocities, accelerations and jerks of each joint.
 
         Raises:
-            ParameterError: Another suffix, or ``controllers`` that do not name each joint once.
+            ParameterError: Another suffix, ``controllers`` that do not name each joint once, unknown ``joints``, or a
+                rate that is too low for the motion, with the lowest one that is not.
             MissingFileError: The file cannot be written.
         """
         path = Path(path_text(path))
-        states, suffix = {name: getattr(self, name) for name in STATES}, suffix_of(path, SUFFIXES)
-        write_atomically(path, encode(suffix, self.times, states, self.joint_names, controllers))
+        suffix = suffix_of(path, SUFFIXES)
+        motion = self.saved(rate=rate, joints=joints, limits=limits)
+        states = {name: getattr(motion, name) for name in STATES}
+        write_atomically(path, encode(suffix, motion.times, states, motion.joint_names, controllers))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Trajectory:
@@ -338,44 +491,21 @@ class Trajectory:
             raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error
 
 
-def concatenate(parts: Sequence[Trajectory]) -> Trajectory:
-    """Return motions one after the other; each starts in the last state of the one before it."""
+def joined(parts: Sequence[Trajectory]) -> Trajectory:
+    """Return motions one after the other as one; each starts in the last state of the one before it.
+
+    Raises:
+        ParameterError: No motion, one of other joints, or one that starts in another state.
+    """
+    if not len(parts):
+        raise ParameterError("parts", parts, "one motion or more")
+    for k, (one, following) in enumerate(pairwise(parts), 1):
+        if following.joint_names != one.joint_names:
+            raise ParameterError(f"parts[{k}]", following, f"a motion of the joints {', '.join(one.joint_names)}")
+        apart = max(float(np.abs(getattr(following, name)[0] - getattr(one, name)[-1]).max()) for name in STATES)
+        if apart > SAME_STATE * max(1.0, float(np.abs(one.accelerations[-1]).max())):
+            raise ParameterError(f"parts[{k}]", f"a start {apart:.3g} away", "a start in the last state before it")
     ends = np.cumsum([0.0, *(part.duration for part in parts)])
     times = [part.times[(k > 0) :] + end for k, (part, end) in enumerate(zip(parts, ends[:-1], strict=True))]
     states = [np.concatenate([getattr(part, name)[(k > 0) :] for k, part in enumerate(parts)]) for name in STATES]
     return Trajectory(np.concatenate(times), states[0], states[1], states[2], parts[0].joint_names)
-
-
-def is_at_rest(motion: Trajectory, time: float) -> bool:
-    """Whether no joint is faster than ``AT_REST`` at a time [s]; before 0 and after the end the robot is at rest."""
-    return bool((np.abs(motion(time, 1)) <= AT_REST).all())
-
-
-def rests(motion: Trajectory) -> Array:
-    """Return the intervals of time in which a motion is at rest, shape (N, 2) [s].
-
-    In each, no joint is ever faster than ``AT_REST``. A moment of rest between two moving pieces is an interval
-    of length zero. Starts and ends of intervals are knots.
-    """
-    slow = np.all(np.abs(motion.velocities) <= AT_REST, axis=1).tolist()
-    resting = _is_resting(motion)
-    found, k, last = list[tuple[int, int]](), 0, len(slow) - 1
-    while k <= last:
-        if slow[k]:
-            end = k
-            while end < last and resting[end]:
-                end += 1
-            found.append((k, end))
-            k = end
-        k += 1
-    return np.asarray(motion.times[np.array(found, int).reshape(-1, 2)])
-
-
-def _is_resting(motion: Trajectory) -> Flags:
-    """Return whether each piece between knots is at rest, shape (K - 1,)."""
-    v, a, j, t = motion.velocities, motion.accelerations[:-1], motion.jerks, np.diff(motion.times)[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        turn = np.clip(np.nan_to_num(-a / j), 0.0, t)  # where the velocity is extreme
-    inner = np.abs(v[:-1] + turn * (a + turn * j / 2.0))
-    fastest = np.maximum(np.maximum(np.abs(v[:-1]), np.abs(v[1:])), inner)
-    return np.asarray((fastest <= AT_REST).all(axis=1))

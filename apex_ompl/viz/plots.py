@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import load_same_robot
-from apex_ompl.timing.trajectory import rests
-from apex_ompl.types import Array
+from apex_ompl.timing.rests import rests
+from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array, Indices
 from apex_ompl.util.files import suffix_of, write_atomically
 from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, PATH_COLORS, SILENT_EVENTS
 from apex_ompl.viz.sources import ORDERS, clearances, robot_of, shares_of_limits
@@ -32,6 +34,9 @@ MARGIN = 0.01  # beside the run, as a share of its duration
 JOINTS = 4  # that have curves of their own, those that come nearest to their limits
 FARTHEST = 0.5  # distance that is shown at most, where the least one is below it [m]
 REST, LARGEST, SEEN = "#dfe3e8", "#30343b", "#b9bec7"  # colors: bands of rest, the largest speed, observations
+WHOLE, SMALL, ZOOM, LEAST_SHARE = 1.3, 0.5, 1.4, 1e-3  # ends of axes, and the share up to which they are enlarged
+STEP_EDGE, KNOT_HEIGHT = 1e-7, 0.05  # time before a step of the jerk [s], and height of a mark as a share of the axis
+JOINT_COLORS = ("#1f5fbf", "#e07b00", "#1e8a4c", "#c22f2f", "#7d4fb3", "#6b4a3a", "#d552a3", "#5a5f66")
 MARKS = ("goal", "contact")  # events that are lines through all rows
 
 
@@ -39,7 +44,7 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     """Draw positions, velocities, accelerations and jerks of a timed motion over time, and its clearance.
 
     Each curve is scaled by the joint's limits: 1 is the upper limit, -1 the lower one. A column shows the joints of a
-    group.
+    group. Axes of derivatives of which only small shares are used are enlarged. The knots are marked below the jerks.
 
     Args:
         result: A result with a trajectory.
@@ -59,31 +64,33 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     checker = assemble(result.problem, robot).checker
     if result.joint_names != robot.joint_names:
         raise ParameterError("result", ", ".join(result.joint_names), f"the joints of {robot.name}")
-    times = np.asarray(motion.sample(max(TIME_STEP, motion.duration / MAX_SAMPLES)).time)
+    spaced = np.asarray(motion.sample(max(TIME_STEP, motion.duration / MAX_SAMPLES)).time)
+    before = np.maximum(motion.times - STEP_EDGE, 0.0)  # jerks are steps
+    times = np.sort(np.concatenate([spaced, motion.times, before]))
     scaled = shares_of_limits(motion, robot, times)
     groups = robot.groups or {"joints": np.arange(robot.dof)}
-
-    figure = Figure(figsize=(4.2 * len(groups), 11), layout="constrained")
+    figure = Figure(figsize=(max(4.2 * len(groups), 7.0), 12.5), layout="constrained")
     grid = figure.add_gridspec(len(ORDERS) + 1, len(groups))
+    ends = -MARGIN * motion.duration, (1.0 + MARGIN) * motion.duration
     for column, (group, joints) in enumerate(groups.items()):
+        names, notes = [robot.joint_names[joint] for joint in joints], _notes(motion, robot, scaled, joints)
         for row, (name, values) in enumerate(zip(ORDERS, scaled, strict=True)):
             axis = figure.add_subplot(grid[row, column])
-            for joint in joints:
-                axis.plot(times, values[:, joint], linewidth=1.2, label=robot.joint_names[joint])
-            for bound in (-1.0, 1.0):
-                axis.axhline(bound, color="black", linewidth=0.8, linestyle="--")
-            axis.set_ylim(-1.15, 1.15)
-            axis.grid(alpha=0.25)
-            axis.tick_params(labelsize=8)
+            _draw_shares(axis, times, values[:, joints], names)
+            axis.set(xlim=ends, ylabel=f"{name}\nshare of limit" if column == 0 else "")
+            top = WHOLE if row == 0 else _reach(values[:, joints])
+            axis.set_ylim(-top, top)
+            axis.text(0.99, 0.98, notes[row], transform=axis.transAxes, ha="right", va="top", fontsize=7)
+            axis.tick_params(labelbottom=row == len(ORDERS) - 1)
             if row == 0:
                 axis.set_title(group.replace("_", " "))
-            if name == "jerk":
-                axis.legend(fontsize=6, ncols=2, loc="lower right")
-            if column == 0:
-                axis.set_ylabel(f"{name}\nshare of limit", fontsize=9)
+                axis.legend(fontsize=7, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.12), frameon=False)
+        axis.vlines(motion.times, -top, (2.0 * KNOT_HEIGHT - 1.0) * top, color=LARGEST, linewidth=0.6)
+        axis.set_xlabel(f"time s; {len(motion.times)} knots" if column == 0 else "time s")
     clearance_times = np.linspace(0.0, motion.duration, CLEARANCE_SAMPLES)
     axis = figure.add_subplot(grid[len(ORDERS), :])
     dynamic = [o for o in result.problem.scene if o.name in result.dynamic_obstacles]
+    axis.set_xlim(*ends)
     axis.plot(clearance_times, 1e3 * clearances(checker, motion, clearance_times, dynamic), color=CLEARANCE_COLORS[0])
     axis.set_ylim(bottom=0.0)
     axis.grid(alpha=0.25)
@@ -93,6 +100,31 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=suffix[1:], dpi=100)
     write_atomically(path, buffer.getvalue())
+
+
+def _draw_shares(axis: Any, times: Array, values: Array, names: Sequence[str]) -> None:
+    """Draw shares of limits over time, shape (N, joints)."""
+    for joint, name in enumerate(names):
+        axis.plot(times, values[:, joint], linewidth=1.2, label=name, color=JOINT_COLORS[joint % len(JOINT_COLORS)])
+    for bound in (-1.0, 1.0):
+        axis.axhline(bound, color="black", linewidth=0.8, linestyle="--")
+    axis.grid(alpha=0.25)
+    axis.tick_params(labelsize=8)
+
+
+def _notes(motion: Trajectory, robot: Robot, scaled: Array, joints: Indices) -> list[str]:
+    """Return a text for each derivative of the motion of some joints, by their shares of limits, shape (4, N, dof)."""
+    smooth = motion.smoothness(robot.limits)
+    notes = [f"largest {np.abs(values[:, joints]).max():.2g}" for values in scaled]
+    notes[2] += f", {np.median(smooth.pulses[joints]):.1f} pulses a second and joint"
+    notes[3] += f", rms {smooth.jerk[joints].max():.2g}"
+    return notes
+
+
+def _reach(values: Array) -> float:
+    """Return the end of an axis of shares of limits: beyond the limits, or nearer where the shares are small."""
+    largest = float(np.abs(values).max())
+    return WHOLE if largest > SMALL else max(ZOOM * largest, LEAST_SHARE)
 
 
 def plot_run(result: RunResult, out: str | os.PathLike[str]) -> None:

@@ -21,7 +21,7 @@ from apex_ompl.timing.spline_method import (
     least_knot_spacing,
     spline_in_time,
 )
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import joined
 
 LIMITS, NAMES = robot().limits, robot().joint_names
 APART_ON_PATH = CONTROL_POINT_SPACING * Timing().deviation  # of control points, as the first that time_path tries [rad]
@@ -58,7 +58,7 @@ def in_all_joints(states: list[tuple[np.ndarray, np.ndarray, np.ndarray]], least
         except ruckig.RuckigError:
             return None
         parts.append(Trajectory(*knots(made), NAMES))
-    return concatenate(parts)
+    return joined(parts)
 
 
 def after_toppra(path: np.ndarray) -> Trajectory | None:

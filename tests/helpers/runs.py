@@ -11,7 +11,7 @@ from apex_ompl.robot.model import digest
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import joined
 
 
 def moved(robot: Robot, **joints: float) -> np.ndarray:
@@ -26,7 +26,7 @@ def motion_between(robot: Robot, *states: np.ndarray, speed: float = 0.4) -> Tra
     """A motion from rest to rest through each of some states, at a share of the velocity limits."""
     timing = Timing(method="spline", velocity_scale=speed)
     pairs = zip(states[:-1], states[1:], strict=True)
-    return concatenate([time_path(np.stack(p), robot.limits, robot.joint_names, timing).trajectory for p in pairs])
+    return joined([time_path(np.stack(p), robot.limits, robot.joint_names, timing).trajectory for p in pairs])
 
 
 def standing(robot: Robot, q: np.ndarray, seconds: float) -> Trajectory:
@@ -48,7 +48,7 @@ def run_by_hand(robot: Robot, joint: str = "left_joint1", link: str = "left_hand
     """A run that sets out, stands for half a second while a ball passes, and goes on to the goal."""
     middle, last = moved(robot, **{joint: -0.4}), moved(robot, **{joint: -0.9})
     first, then = motion_between(robot, robot.home, middle), motion_between(robot, middle, last)
-    motion = concatenate([first, standing(robot, middle, 0.5), then])
+    motion = joined([first, standing(robot, middle, 0.5), then])
     hand = robot.link_pose(middle, link)[:3, 3] + (0.35, 0.0, 0.0)
     rows = tuple((t, *(hand + (0.0, 0.0, z))) for t, z in ((0.0, -0.4), (1.0, 0.4), (motion.duration, 0.6)))
     ball = Obstacle(name="ball", sphere={"radius": 0.08}, trajectory=rows)

@@ -42,6 +42,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         "--max-velocity left_joint1=1.5 --max-acceleration left_joint1=10 --max-jerk left_joint1=1000 "
         "--minimum-duration 2.5 --out motion.traj.yaml --controllers --json",
     ),
+    ((0,), "plan own.yaml --timeout 20 --out sampled.csv --rate 1000 --joints left_arm,right_hand_synergy"),
     ((0,), "plan ball_in_cup --timeout 20 --no-timing --out path.json"),
     (
         (0, 1),

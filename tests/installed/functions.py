@@ -173,6 +173,13 @@ def _use_trajectories() -> None:
     assert motion.states(motion.times).shape == (3, len(motion.times), robot.dof) and len(motion.knots) == 4
     assert isinstance(motion.sample(0.1), Sample) and len(list(motion.stream(100.0))) > 100
     assert motion.slower(2.0).duration > motion.after(0.5).duration
+    stopped = motion.stop_at(0.3, robot.limits)
+    assert stopped.duration < motion.duration and motion.merged() is motion
+    rest = apex_ompl.time_path(np.stack([stopped.positions[-1], path[-1]]), robot.limits, robot.joint_names, timing)
+    whole = apex_ompl.timing.joined([stopped, rest.trajectory])
+    assert whole.deviation(whole.resampled(1000.0)) < 1e-3 and whole.before(0.1).duration == 0.1
+    assert whole.smoothness(robot.limits).jerk.max() < 1.0
+    assert whole.saved(rate=1000.0, joints=robot.joint_names[:2]).dof == whole.selected(robot.joint_names[:2]).dof == 2
     assert apex_ompl.Trajectory.unchecked(motion.times, motion.states(motion.times), motion.joint_names).duration
     for name in ("motion.npz", "motion.csv", "motion.traj.yaml", "motion.traj.json"):
         motion.save(name)

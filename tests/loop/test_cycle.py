@@ -21,7 +21,7 @@ from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems import worlds
 from apex_ompl.scene.scripts import place_at
-from apex_ompl.timing.trajectory import is_at_rest
+from apex_ompl.timing.rests import is_at_rest
 
 PERIOD, NAN = LoopSettings.period, float("nan")
 

@@ -36,8 +36,8 @@ from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.timing import Trajectory
+from apex_ompl.timing.rests import is_at_rest
 from apex_ompl.timing.timed_spline import Start
-from apex_ompl.timing.trajectory import is_at_rest
 
 
 def reasons(done: RunRecord) -> set[str]:

@@ -23,7 +23,7 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.timing import time_path
-from apex_ompl.timing.trajectory import is_at_rest
+from apex_ompl.timing.rests import is_at_rest
 
 MOVING = "vertical/moving-large-0.2/800001"
 NAN = float("nan")

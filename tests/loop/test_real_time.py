@@ -34,7 +34,7 @@ from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
 from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.problems.worlds import DynamicEnvironment
-from apex_ompl.timing.trajectory import is_at_rest
+from apex_ompl.timing.rests import is_at_rest
 
 
 class BadEyes:

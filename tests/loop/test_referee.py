@@ -19,7 +19,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there, place_at
 from apex_ompl.timing import Timing, Trajectory, time_path
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import joined
 
 SHAPES = [
     {"box": (0.12, 0.1, 0.08)}, {"sphere": {"radius": 0.06}}, {"cylinder": {"radius": 0.05, "length": 0.15}},
@@ -121,7 +121,7 @@ def test_the_clearance_is_a_lower_bound(robot: Robot, seed: int) -> None:
 def there_and_stay(robot: Robot) -> Trajectory:
     """A motion of the left arm, and a second of rest."""
     goal = moved(robot, left_joint1=-0.6)
-    return concatenate([motion_between(robot, robot.home, goal), standing(robot, goal, 1.0)])
+    return joined([motion_between(robot, robot.home, goal), standing(robot, goal, 1.0)])
 
 
 def hand_at(robot: Robot, motion: Trajectory, time: float) -> np.ndarray:
@@ -275,7 +275,7 @@ def test_pieces_are_the_legs_of_all_scripts(robot: Robot) -> None:
 def test_a_contact_while_the_robot_moves_counts_behind_one_at_rest(robot: Robot) -> None:
     """A ball comes to the hand at rest, stays there, and the robot moves off with it."""
     goal = moved(robot, left_joint1=-0.6)
-    motion = concatenate([standing(robot, robot.home, 0.5), motion_between(robot, robot.home, goal)])
+    motion = joined([standing(robot, robot.home, 0.5), motion_between(robot, robot.home, goal)])
     meet = hand_at(robot, motion, 0.0)
     for leaves, outcome in ((0.45, Outcome.HIT_AT_REST), (motion.duration, Outcome.HIT_MOVING)):
         rows = ((0.0, 2.0), (0.2, 0.0), (leaves - 0.1, 0.0), (leaves, 2.0))

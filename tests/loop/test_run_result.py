@@ -18,7 +18,8 @@ from apex_ompl.loop.metrics import failure_ratio, run_metrics
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.robot import Robot
 from apex_ompl.timing.files import KNOTS
-from apex_ompl.timing.trajectory import concatenate, is_at_rest, rests
+from apex_ompl.timing.rests import is_at_rest, rests
+from apex_ompl.timing.trajectory import joined
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +134,7 @@ def test_archives_of_something_else_are_refused(run: RunResult, tmp_path: Path) 
 def test_rests_are_where_a_motion_stands(robot: Robot) -> None:
     a, b, c = robot.home, moved(robot, left_joint1=-0.3), moved(robot, left_joint1=-0.6)
     parts = [motion_between(robot, a, b), standing(robot, b, 0.4), motion_between(robot, b, c, a)]
-    motion = concatenate(parts)
+    motion = joined(parts)
     turn = parts[0].duration + 0.4 + motion_between(robot, b, c).duration
     begin = parts[0].duration
     wanted = [[0.0, 0.0], [begin, begin + 0.4], [turn, turn], [motion.duration] * 2]
@@ -163,7 +164,7 @@ def test_metrics_come_from_events_and_motion(run: RunResult, robot: Robot) -> No
 
 def test_standing_at_the_beginning_and_at_the_goal_is_no_stop(robot: Robot) -> None:
     a, b = robot.home, moved(robot, left_joint1=-0.3)
-    motion = concatenate([standing(robot, a, 0.3), motion_between(robot, a, b), standing(robot, b, 0.7)])
+    motion = joined([standing(robot, a, 0.3), motion_between(robot, a, b), standing(robot, b, 0.7)])
     goal = [Event(motion.duration - 0.6, "goal")]
     found = run_metrics(motion, goal, robot.limits)
     assert found["stops"] == 0.0 and found["rest_time"] == pytest.approx(0.3)

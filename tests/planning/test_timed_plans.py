@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from followed import follow, read
 
 from apex_ompl import api, cli, plan, planning
 from apex_ompl.errors import ParameterError, TimingError
@@ -31,6 +32,22 @@ def test_plans_are_timed_and_checked() -> None:
     assert result.times["timing"] > 0.0 and result.times["timing proof"] > 0.0
     assert result.as_dict()["duration"] == motion.duration
     assert 0.0 < result.motion_clearance and 0.0 < result.clearance_bound <= result.clearance
+
+
+@pytest.mark.parametrize(("problem", "suffix"), [("ball_in_cup", ".traj.json"), ("reach_past_post", ".csv")])
+def test_what_a_controller_makes_of_a_saved_plan_is_what_was_proved(problem: str, suffix: str, tmp_path: Path) -> None:
+    result = plan(problem, timeout=20.0)
+    motion, ready, file = result.trajectory, assemble(result.problem), tmp_path / f"motion{suffix}"
+    assert motion is not None and motion.merged() is motion and np.diff(motion.times).min() >= 1e-3 - 1e-9
+    result.save(file)
+    points, limits = read(file), ready.robot.limits
+    rows = follow(points)
+    for row, bound in zip(rows[1:], (limits.velocity, limits.acceleration, limits.jerk), strict=True):
+        assert np.all(np.abs(row) <= 1.001 * bound)
+    states = np.concatenate([rows[0][:, :-1].reshape(-1, motion.dof), points.states[0, -1:]])
+    assert full_check(ready.checker, states, ready.start, ready.goals)
+    sampled = motion.saved(rate=1000.0, limits=limits)
+    assert full_check(ready.checker, sampled, ready.start, ready.goals) and sampled.deviation(motion) < 1e-5
 
 
 def test_results_without_a_proof_are_read(tmp_path: Path) -> None:
@@ -95,6 +112,12 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
     out = tmp_path / "c.traj.json"
     assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
     assert Trajectory.load(out).dof == 16 and "left_arm_controller" in out.read_text()
+    out = tmp_path / "s.csv"
+    part = ["--rate", "500", "--joints", "right_arm,left_hand_synergy"]
+    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), *part]) == 0
+    sampled = Trajectory.load(out)
+    assert sampled.joint_names == (*(f"right_joint{k}" for k in range(1, 8)), "left_hand_synergy")
+    np.testing.assert_allclose(np.diff(sampled.times)[:-1], 0.002, atol=1.1e-9)
     out = tmp_path / "r.npz"
     assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out)]) == 0
     saved = PlanResult.load(out)
@@ -114,6 +137,11 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
         (["plot", str(tmp_path / "none.npz"), "-o", str(tmp_path / "q.png")], "none.npz"),
         (["plan", "ball_in_cup", "--jerk-scale", "2"], "jerk_scale"),
         (["plan", "ball_in_cup", "--controllers"], "--controllers"),
+        (["plan", "ball_in_cup", "--rate", "100"], "--rate"),
+        (["plan", "ball_in_cup", "--rate", "0", "--out", str(tmp_path / "q.csv")], "--rate"),
+        (["plan", "ball_in_cup", "--joints", "left_arm", "--out", str(tmp_path / "q.npz")], "--joints"),
+        (["plan", "ball_in_cup", "--joints", "left_foot", "--out", str(tmp_path / "q.csv")], "joint 'left_foot'"),
+        (["plan", "ball_in_cup", "--rate", "5", "--out", str(tmp_path / "q.csv")], "Hz, at which this motion keeps"),
         (["plan", "ball_in_cup", "--no-timing", "--out", str(tmp_path / "q.traj.yaml")], "--no-timing"),
     ):
         capsys.readouterr()

@@ -9,7 +9,7 @@ from timings import LIMITS, NAMES, RATE, paths, timed
 from apex_ompl.errors import TimingError
 from apex_ompl.timing import Timing, time_path
 from apex_ompl.timing.ruckig_method import between, through
-from apex_ompl.timing.trajectory import concatenate
+from apex_ompl.timing.trajectory import joined
 
 
 @settings(max_examples=30)
@@ -58,7 +58,7 @@ def test_motions_through_states_are_the_motions_between_them(seed: int, pieces: 
     if made is None:
         assert any(one is None for one in each)
         return
-    wanted = concatenate([one for one in each if one is not None])
+    wanted = joined([one for one in each if one is not None])
     assert len(solved) == pieces and made.duration == pytest.approx(wanted.duration, abs=1e-8)
     np.testing.assert_allclose(made.states(wanted.times), wanted.states(wanted.times), atol=1e-4)
     np.testing.assert_array_equal(made.positions[-1], states[0, -1])

@@ -5,8 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import ruckig
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import distance
 from timings import LIMITS, NAMES, RATE, keeps_limits, paths, timed
@@ -17,8 +16,6 @@ from apex_ompl.robot import Limits
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.curve import Curve, Polyline
 from apex_ompl.timing.parameterization import DEFAULT_METHOD, METHODS
-from apex_ompl.timing.ruckig_method import through_knots
-from apex_ompl.timing.spline_method import blend
 
 
 @settings(max_examples=40)
@@ -39,40 +36,6 @@ def test_motions_keep_all_limits_and_stay_near_their_paths(
     assert made.deviation <= deviation
     dense = motion(np.linspace(0.0, motion.duration, 20_001))
     assert distance(dense, path) <= made.deviation + 1e-9, "measured against all sides"
-
-
-@settings(max_examples=20)
-@given(seed=st.integers(0, 999), stride=st.sampled_from([1, 2, 3]))
-def test_a_blended_motion_by_ruckig_is_what_ruckig_makes_between_the_knots(seed: int, stride: int) -> None:
-    """Ruckig's own ``at_time``, problem by problem."""
-    rng = np.random.default_rng(seed)
-    t = np.linspace(0.0, 1.0, 256)[:, None]
-    path = np.sin(2.0 * np.pi * t * rng.uniform(0.1, 1.5, 3) + rng.uniform(0.0, 6.0, 3)) * rng.uniform(0.1, 2.5, 3)
-    found = blend(Polyline.through(path), LIMITS, NAMES, 0.05)
-    assert found is not None
-    guide = found.trajectory
-    motion = through_knots(guide, LIMITS, stride)
-    assert motion is not None
-    slower = motion.duration / guide.duration
-    assume(slower < 1.001)  # a target may be out of reach in the wanted time and for some time after
-    chosen = [*range(0, len(guide.times) - 1, stride), len(guide.times) - 1]
-    solver, query, begin = ruckig.Ruckig(3), ruckig.InputParameter(3), 0.0
-    for name in ("velocity", "acceleration", "jerk"):
-        setattr(query, f"max_{name}", (getattr(LIMITS, name) * (1.0 + 1e-10)).tolist())
-    for k, following in pairwise(chosen):
-        for which, at in (("current", k), ("target", following)):
-            for name, values in (
-                ("position", guide.positions), ("velocity", guide.velocities), ("acceleration", guide.accelerations)
-            ):  # fmt: skip
-                setattr(query, f"{which}_{name}", values[at].tolist())
-        query.minimum_duration = float(guide.times[following] - guide.times[k])
-        solution = ruckig.Trajectory(3)
-        solver.calculate(query, solution)
-        for since in np.linspace(0.0, solution.duration, 7):
-            own = np.array(solution.at_time(float(since))[:2])
-            ours = np.array([motion((begin + since) * slower, order) * slower**order for order in range(2)])
-            np.testing.assert_allclose(ours, own, atol=1e-5)
-        begin += solution.duration
 
 
 def test_the_method_is_chosen_by_name_and_reported() -> None:
@@ -103,7 +66,7 @@ def test_ten_thousand_points_keep_the_limits() -> None:
 
 
 @pytest.mark.parametrize("length", [1e-4, 0.01, 0.6, 4.0])
-def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
+def test_a_straight_line_takes_half_a_percent_more_than_the_least_time_there_is(length: float) -> None:
     """Seven phases of constant jerk, each as long as its limit lets it be (Biagiotti and Melchiorri 2008, 3.4)."""
     v, a, j = 2.0, 10.0, 5000.0
     path = np.array([[-length / 2.0, 0.0, 0.0], [length / 2.0, 0.0, 0.0]])
@@ -116,8 +79,13 @@ def test_a_straight_line_takes_the_least_time_there_is(length: float) -> None:
         least = 4.0 * np.cbrt(length / (2.0 * j))
     made = timed(path)
     assert made.form == "line" and made.deviation == 0.0
-    assert made.trajectory.duration == pytest.approx(least, rel=1e-5)
-    assert keeps_limits(made.trajectory)
+    motion = made.trajectory
+    if length > 1e-3:
+        assert motion.duration == pytest.approx(1.005 * least, rel=5e-4)
+    else:  # its largest acceleration would last for less than a millisecond
+        assert least < motion.duration < 1.05 * least
+    assert keeps_limits(motion) and np.diff(motion.times).min() >= 1e-3 - 1e-12 and len(motion.times) <= 8
+    assert np.abs(motion.jerks).max() < 0.995 * j, "in exchange for the time"
 
 
 @pytest.mark.parametrize("jerk", [1e8, 1e11, 1e12, 1e300, np.inf])
@@ -126,7 +94,8 @@ def test_without_a_limit_of_jerk_motions_are_the_fastest_within_the_others(jerk:
     free = replace(LIMITS, jerk=np.full(3, jerk))
     path = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.4], [0.0, 0.2, 0.0]])
     made = timed(path[:2], limits=free).trajectory
-    assert made.duration == pytest.approx(2.0 * np.sqrt(0.3 / LIMITS.acceleration[0]), rel=1e-5)
+    least = 2.0 * np.sqrt(0.3 / LIMITS.acceleration[0])
+    assert least < made.duration <= 1.0051 * least and np.diff(made.times).min() >= 1e-3 - 1e-12
     for method in METHODS:
         limited, motion = (timed(path, Timing(method), limits=one).trajectory for one in (LIMITS, free))
         assert motion.duration <= limited.duration * (1.0 + 1e-3)
