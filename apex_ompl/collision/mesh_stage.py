@@ -246,15 +246,13 @@ class MeshStage:
     def _near(self) -> Iterator[Pair]:
         """Yield the pairs with held objects or obstacles whose boxes overlap at the current placements."""
         moving, obstacles = self.moving, list(self.scene.values())
-        boxes = self._boxes(moving)
-        for i, j in np.argwhere(overlaps(boxes, self._boxes(obstacles))).tolist():
+        bodies = [*moving, *(k for k in range(self.links) if self.solids[k].joint == 0)]
+        boxes = self._boxes(bodies)
+        for i, j in np.argwhere(overlaps(boxes[: len(moving)], self._boxes(obstacles))).tolist():
             if not self._may_touch(moving[i], obstacles[j]):
                 yield moving[i], obstacles[j]
-        if self.held:
-            bodies = [*range(self.links), *self.held.values()]
-            boxes, row = self._boxes(bodies), {number: k for k, number in enumerate(bodies)}
-            near = overlaps(boxes + BOX_SLACK, boxes)
-            yield from ((i, j) for i, j in self._held_pairs() if near[row[i], row[j]])
+        near, row = overlaps(boxes + BOX_SLACK, boxes), {number: k for k, number in enumerate(bodies)}
+        yield from ((i, j) for i, j in self._held_pairs() if near[row[i], row[j]])
 
     def _boxes(self, numbers: Sequence[int]) -> Array:
         """Return the boxes around solids at the current placements, shape (n, 2, 3) [m]."""
