@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
-from apex_ompl.problems.world_scripts import ScriptedEnvironment
+from apex_ompl.problems.worlds import ScriptedEnvironment
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array

@@ -30,7 +30,7 @@ import trimesh
 from tqdm import tqdm
 
 from apex_ompl import MotionPlanner, PlanResult, load_model, load_problem, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.model.proposals import TrajectoryModel
 from apex_ompl.ompl.process import quiet_ompl

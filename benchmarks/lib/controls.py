@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from apex_ompl import problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.model.array_model import ArrayModel
 from apex_ompl.model.proposals import Proposals
 from apex_ompl.model.query import Query

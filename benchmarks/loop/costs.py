@@ -262,7 +262,7 @@ def anew(search: Search) -> Search:
 
 def network() -> dict[str, float]:
     """Return the costs of a call of the network, of each proposal, and of each chunk of the imitation policy [s]."""
-    from apex_ompl.apex.query import make_query
+    from apex_ompl.apex.models import make_query
 
     setup = assemble(worlds.load("vertical/moving-large-0.2/800000").problem.still)
     context, source = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Proposals()

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from apex_ompl import problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.evaluation import Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import load_model, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.model.checkpoint import shipped
 from apex_ompl.model.guidance import Guidance
 from apex_ompl.model.proposals import Sampling
@@ -26,7 +26,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
-DEPENDS = ("apex_ompl/model", "apex_ompl/apex/query.py", "apex_ompl/kernel", "apex_ompl/ompl", "problems")
+DEPENDS = ("apex_ompl/model", "apex_ompl/apex/models.py", "apex_ompl/kernel", "apex_ompl/ompl", "problems")
 PROBLEM = "shelf/hard/800003"
 COUNTS = (1, 4, 8, 32)
 STEPS = (1, 2, 8)

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import load_model
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run

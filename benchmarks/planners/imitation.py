@@ -19,7 +19,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl import planners, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.baselines.imitation.planner import Imitation
 from apex_ompl.baselines.imitation.policy import shared_policy
 from apex_ompl.goals.alignment import AlignmentGoal

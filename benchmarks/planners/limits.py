@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import load_model, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.kernel.compiled.arrays import robot_view
 from apex_ompl.kernel.compiled.compilation import entry_point, reassociating_entry_point
 from apex_ompl.kernel.compiled.layout import Floats, Integers

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.apex.models import NONE, Model, trajectory_model
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import NONE, Model, make_query, trajectory_model
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run

@@ -29,8 +29,8 @@ from apex_ompl import planners
 from apex_ompl.evaluation import Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.ompl.repair import simplify
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check

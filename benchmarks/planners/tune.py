@@ -44,7 +44,7 @@ from benchmarks.lib import record
 DEPENDS = (
     "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/evaluation", "apex_ompl/model",
     "apex_ompl/ompl/own_planner.py", "apex_ompl/ompl/parameters.py", "apex_ompl/ompl/repair.py",
-    "apex_ompl/ompl/setup.py", "apex_ompl/ompl/simplify.py", "apex_ompl/ompl/space.py", "apex_ompl/ompl/validity.py",
+    "apex_ompl/ompl/setup.py", "apex_ompl/ompl/space.py", "apex_ompl/ompl/validity.py",
     "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/baselines", "apex_ompl/goals", "apex_ompl/paths",
     "benchmarks/baselines", "benchmarks/planners/peers.py", "planners", "problems",
 )  # fmt: skip

@@ -30,9 +30,8 @@ from apex_ompl.problems.broad_representation import (
     part_of,
 )  # fmt: skip
 from apex_ompl.problems.broad_tasks import KINDS, OPEN, clear_parts, difficulty, draw_held, scene_of, sprint
-from apex_ompl.problems.catalogue import ProblemId
+from apex_ompl.problems.catalogue import ProblemId, first_drawn
 from apex_ompl.problems.frozen import digest
-from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import empty_hand_tables
 from apex_ompl.robot import Robot
 from apex_ompl.training.units import Unit, plan_units, problem_record

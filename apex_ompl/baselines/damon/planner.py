@@ -11,11 +11,10 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.start_goal import read_goals, read_starts
 from apex_ompl.baselines.damon.latent_graph import Damon
 from apex_ompl.baselines.damon.manifold import shared_manifold
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.own_planner import OwnPlanner, read_goals, read_starts
 from apex_ompl.ompl.parameters import Parameters, bounded, one_of, register
 from apex_ompl.ompl.space import motions_free
 from apex_ompl.ompl.tuned import TUNED

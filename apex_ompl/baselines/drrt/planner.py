@@ -11,11 +11,10 @@ import numpy as np
 from ompl import base as ob
 from ompl import util as ou
 
-from apex_ompl.apex.start_goal import read_goals, read_starts
 from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT, GoalTree
 from apex_ompl.collision.path_proof import may_have_become_blocked
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl.own_planner import OwnPlanner, Tree
+from apex_ompl.ompl.own_planner import OwnPlanner, Tree, read_goals, read_starts
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import motions_free, require_real_vectors
 from apex_ompl.ompl.tuned import TUNED

@@ -13,13 +13,12 @@ from ompl import base as ob
 from ompl import util as ou
 
 from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
-from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
 from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
 from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Optimum
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
-from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.kernel.path import ClearanceCosts, clearance_costs
+from apex_ompl.ompl.own_planner import OwnPlanner, nearest_pairs, read_goals, read_starts
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import bounds_of
 from apex_ompl.ompl.tuned import TUNED

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from ompl import base as ob
 
+from apex_ompl.apex.models import make_query
 from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
-from apex_ompl.apex.query import make_query
-from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
-from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.own_planner import OwnPlanner, nearest_pairs, read_goals, read_starts
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import bounds_of, to_state
 from apex_ompl.ompl.validity import full_check
