@@ -11,7 +11,7 @@ into those for training, validation and tests as the suites' are.
 - ``interceptor``: a cube at constant velocity would meet the first motion (the same module).
 - ``turning``: a cube takes a new direction every .5 to 2 s (:mod:`apex_ompl.problems.world_wanderers`).
 - ``crowd``: three cubes cross in front of the robot (the same module).
-- ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_pusher`).
+- ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_ambushes`).
 """
 
 from __future__ import annotations
@@ -253,8 +253,7 @@ def load(name: str) -> DynamicEnvironment:
 
 def _drawn(world: WorldId) -> DynamicEnvironment:
     """Return the world of an id."""
-    from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment
-    from apex_ompl.problems.world_pusher import PusherEnvironment
+    from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment, PusherEnvironment
     from apex_ompl.problems.world_wanderers import WanderersEnvironment
 
     level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())

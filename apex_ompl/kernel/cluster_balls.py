@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from apex_ompl.kernel.compiled.arrays import BINS, LIMIT_SLACK, PRISMATIC, REVOLUTE
-from apex_ompl.kernel.joint_tree import BodySpec, JointSpec
 from apex_ompl.kernel.products import product
+from apex_ompl.kernel.tables import BodySpec, JointSpec
 from apex_ompl.types import Array
 
 OF_BIN = 4  # steps between the values at which balls are made, in a range of values

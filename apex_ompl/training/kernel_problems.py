@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.arrays import GRID_ROW, SceneArrays
-from apex_ompl.kernel.table_checks import scene_fault
-from apex_ompl.kernel.tables import SceneTables
+from apex_ompl.kernel.tables import SceneTables, scene_fault
 from apex_ompl.model.geometry import SHAPES, ObstacleRecord
 from apex_ompl.model.proposals import Sampling, TrajectoryModel
 from apex_ompl.model.query import ObstacleSet, Query

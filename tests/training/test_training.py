@@ -33,10 +33,10 @@ from apex_ompl.training.kernel_problems import (
     success_rates,
 )
 from apex_ompl.training.records import Paths
-from apex_ompl.training.run_files import read_log
+from apex_ompl.training.run import TrainingError, read_log
 from apex_ompl.training.store import Store, load, save
 from apex_ompl.training.torch_model import TorchModel, load_torch_model
-from apex_ompl.training.training import DistributedProcess, Trainer, TrainingError
+from apex_ompl.training.training import DistributedProcess, Trainer
 from apex_ompl.util.process import one_torch_thread
 
 
