@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ompl import geometric as og
 
     from apex_ompl.apex.models import ProposalSampler
-    from apex_ompl.apex.trees import OmplTrees
+    from apex_ompl.apex.stages.trees import OmplTrees
     from apex_ompl.kernel.search import SearchCounts, TreePair
     from apex_ompl.model.query import Query
 

@@ -41,11 +41,11 @@ def head_fault(head: dict[str, Any]) -> str:
 def scene_fault(s: SceneArrays) -> str:
     """Return the name of an array with another type or length, or with numbers out of range; else an empty string."""
     obstacles, boxes = len(s.kind), len(s.tree_skip)
-    for field in layout(SceneArrays):
-        name, array = field.name, getattr(s, field.name)
-        if field.single:
+    for part in layout(SceneArrays):
+        name, array = part.name, getattr(s, part.name)
+        if part.single:
             continue
-        if array.dtype != field.dtype or array.shape[1:] != field.shape:
+        if array.dtype != part.dtype or array.shape[1:] != part.shape:
             return name
         size = boxes if name.startswith("tree") else {"open": 1, "allowed": len(s.allowed)}.get(name, obstacles)
         if len(array) != size or not np.isfinite(array).all():

@@ -23,7 +23,7 @@ import numpy as np
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.evaluation import Row, Workers, bench, runs
-from apex_ompl.evaluation.log import short
+from apex_ompl.evaluation.results import short
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
 from apex_ompl.ompl import setup

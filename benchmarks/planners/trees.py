@@ -20,7 +20,7 @@ from ompl import base as ob
 from tqdm import tqdm
 
 from apex_ompl import problems
-from apex_ompl.apex.trees import ompl_trees
+from apex_ompl.apex.stages.trees import ompl_trees
 from apex_ompl.kernel.search import TreePair
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble

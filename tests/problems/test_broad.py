@@ -16,7 +16,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.problems import broad_parts, generator
+from apex_ompl.problems import broad_parts, catalogue
 from apex_ompl.problems.broad import GRAMMARS
 from apex_ompl.problems.broad_parts import site
 from apex_ompl.problems.broad_representation import (
@@ -174,7 +174,7 @@ def test_classes_of_difficulty_are_in_order(robot: Robot) -> None:
 
 def test_obstacles_of_a_problem_as_primitives_are_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = problems.load("broad/boulders/7")
-    monkeypatch.setattr(generator, "draw", None)
+    monkeypatch.setattr(catalogue, "draw", None)
     assert len(problems.primitives(problem, enclosing=True)) > 0
 
 

@@ -15,7 +15,7 @@ from ompl import base as ob
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.proposals import BATCH, PROPOSED, RESAMPLED
-from apex_ompl.apex.trees import OMPL_SHARE, compiled_trees, grow, ompl_trees
+from apex_ompl.apex.stages.trees import OMPL_SHARE, compiled_trees, grow, ompl_trees
 from apex_ompl.kernel.search import ENOUGH, RESOLUTION, shortcut
 from apex_ompl.model.query import Query
 from apex_ompl.ompl.repair import simplify

@@ -1,8 +1,11 @@
 """RRT-Connect inside APEX: sprints before proposals, bridges, and turns of growing length that make it complete.
 
-Trees in compiled code grow first where this project's checker decides; OMPL's have their turns beside them. Bridges
-are short trees that plan blocked stretches of the best candidates anew. At the end of the search, turns of trees and
-rounds of proposals share what time is left.
+Where this project's checker decides, trees grow in compiled code (:class:`apex_ompl.kernel.search.TreePair`), several
+times as fast as OMPL's, which ask for each motion. They go only where the spheres prove that it is free; OMPL's
+RRTConnect, with the exact check, has its turns beside them, and is what runs with another checker.
+
+Bridges are short trees that plan blocked stretches of the best candidates anew. At the end of the search, turns of
+trees and rounds of proposals share what time is left.
 """
 
 from __future__ import annotations
@@ -14,15 +17,79 @@ from itertools import count
 
 import numpy as np
 from ompl import base as ob
+from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext, joins
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.stages.proposals import Farthest
 from apex_ompl.apex.stages.stage import Solution, Stage, run_stage
-from apex_ompl.apex.trees import OMPL_SHARE, compiled_trees, grow, ompl_trees, rooted_ompl_trees, rooted_trees
-from apex_ompl.ompl.space import path_to_array
-from apex_ompl.paths.path import Path
+from apex_ompl.kernel.search import TreePair
+from apex_ompl.ompl.space import path_to_array, to_state
+from apex_ompl.paths.path import SEARCH_RESOLUTION, Path
 from apex_ompl.types import Array
+
+OMPL_RANGE = 0.2  # OMPL's choice of the longest step, as a share of the extent of the space
+OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
+OmplTrees = tuple[og.RRTConnect, ob.ProblemDefinition]
+
+
+def ompl_trees(si: ob.SpaceInformation, starts: Sequence[Array], goal: Array | ob.Goal, tree_range: float) -> OmplTrees:
+    """Return OMPL's RRTConnect, and its problem definition, between starts and a goal.
+
+    Args:
+        si: OMPL's space information.
+        starts: Start states, each of shape (dof,).
+        goal: A state, shape (dof,), or OMPL's goal.
+        tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
+    """
+    pdef = ob.ProblemDefinition(si)
+    for start in starts:
+        pdef.addStartState(to_state(si, start))
+    if isinstance(goal, np.ndarray):
+        pdef.setGoalState(to_state(si, goal))
+    else:
+        pdef.setGoal(goal)
+    tree = og.RRTConnect(si)
+    if tree_range > 0.0:
+        tree.setRange(tree_range)
+    tree.setProblemDefinition(pdef)
+    tree.setup()
+    return tree, pdef
+
+
+def compiled_trees(
+    context: SolveContext, starts: Sequence[Array], goals: Sequence[Array], tree_range: float
+) -> TreePair:  # fmt: skip
+    """Return trees in compiled code from starts to goals, each of shape (dof,); a range of 0 is OMPL's choice [rad]."""
+    longest = tree_range if tree_range > 0.0 else OMPL_RANGE * context.si.getStateSpace().getMaximumExtent()
+    rng = context.rng.spawn(1)[0]
+    return TreePair(context.kernel, np.array(starts), np.array(goals), longest, SEARCH_RESOLUTION, rng)
+
+
+def rooted_trees(
+    context: SolveContext, starts: Sequence[Array], goals: Sequence[Array], tree_range: float
+) -> TreePair:  # fmt: skip
+    """Return compiled trees whose roots are starts and goals of the problem; OMPL's planner data are theirs."""
+    trees = compiled_trees(context, starts, goals, tree_range)
+    context.grown.append(trees)
+    return trees
+
+
+def rooted_ompl_trees(
+    context: SolveContext, starts: Sequence[Array], goal: Array | ob.Goal, tree_range: float
+) -> OmplTrees:  # fmt: skip
+    """Return OMPL's trees whose roots are starts and goals of the problem; OMPL's planner data are theirs."""
+    trees = ompl_trees(context.validator.si, starts, goal, tree_range)
+    context.grown.append(trees[0])
+    return trees
+
+
+def grow(context: SolveContext, trees: TreePair, iterations: int) -> Array | None:
+    """Return the path of compiled trees after some more iterations, or None; add their checks to the counts."""
+    found = trees.grow(iterations, context.stop)
+    context.note_search(trees.take_counts())
+    return found
+
 
 MAX_BRIDGED = 2  # candidates
 MAX_CALLS = 4_000  # iterations of one bridge
