@@ -170,6 +170,17 @@ class OwnPlanner(ob.Planner):
         """Solve the problem, and return OMPL's status."""
         raise NotImplementedError
 
+    def _ends(self, ptc: ob.PlannerTerminationCondition) -> tuple[list[Array], list[Array], Any]:
+        """Return the valid starts and goals, each of shape (dof,), and a status where there are none, else None."""
+        inputs, dof = self.getPlannerInputStates(), int(self.getSpaceInformation().getStateDimension())
+        starts, goals = read_starts(inputs, dof), read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
+        if starts and goals:
+            return starts, goals, None
+        self.report.reason = "no valid goal state was sampled" if starts else "no start state is valid"
+        if not starts:
+            return starts, goals, Status.INVALID_START
+        return starts, goals, Status.TIMEOUT if ptc() else Status.INVALID_GOAL
+
     def clear(self) -> None:
         """Forget the last solution."""
         super().clear()

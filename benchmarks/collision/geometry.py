@@ -17,7 +17,6 @@ Usage: python -m benchmarks.collision.geometry [-n 60] [--states 2000]
 
 from __future__ import annotations
 
-import argparse
 import resource
 import tempfile
 import time
@@ -251,8 +250,7 @@ def updates() -> tuple[list[str], dict[str, Any]]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=60, help="problems and scenes (default: %(default)s)")
+    parser = record.parser(__doc__, n=60, of="problems and scenes")
     parser.add_argument("--states", type=one_or_more, default=2000, help="states of a problem (default: %(default)s)")
     args = parser.parse_args()
     rows, figures = sizes()

@@ -7,7 +7,6 @@ Usage: python -m benchmarks.model.model_latency [--repeat 30]
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import time
@@ -66,7 +65,7 @@ def load_seconds(name: str, repeat: int = 5) -> float:
 
 def main() -> None:
     """Measure all that ship, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--repeat", type=one_or_more, default=30)
     args = parser.parse_args()
     lines = [["model", "B", "steps", "guided", "condition ms", "network ms", "guidance ms", "decode ms", "total ms"]]

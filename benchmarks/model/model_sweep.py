@@ -100,7 +100,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 def main() -> None:
     """Train, evaluate, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--steps", type=one_or_more, default=3000, help="of each (default: %(default)s)")
     parser.add_argument("--threads", type=one_or_more, default=1, help="of each (default: %(default)s)")
     parser.add_argument("--jobs", type=one_or_more, default=2, help="trained at a time (default: %(default)s)")

@@ -9,7 +9,6 @@ Usage: python -m benchmarks.planners.trees [-n 6] [--seeds 2]
 
 from __future__ import annotations
 
-import argparse
 import time
 from itertools import count
 from types import SimpleNamespace
@@ -70,8 +69,7 @@ def compiled(ready: PlanningSetup, seed: int) -> tuple[Array | None, int, int]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=6, help="problems of a level (default: %(default)s)")
+    parser = record.parser(__doc__, n=6)
     parser.add_argument("--seeds", type=one_or_more, default=2, help="seeds of each (default: %(default)s)")
     args = parser.parse_args()
     names = [n for level in HARD for n in problems.frozen_names(*level.split("/"), "validation")[: args.n]]
