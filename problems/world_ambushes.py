@@ -1,8 +1,9 @@
-"""Cubes that answer to the robot's first motion: ``popup``, which comes into being before it, and ``interceptor``.
+"""Cubes that answer to the robot: ``popup``, which comes into being before it, ``interceptor`` and ``pusher``.
 
 That an obstacle is put into the way while the robot moves is the paper's experiment; distances, speeds and times are
 this project's own choice. A cube that moves does so horizontally, for ever, and does not come to where an arm cannot
-evade it. Where no draw has room, there is no cube.
+evade it. Where no draw has room, there is no cube. A pusher comes towards the robot and leaves again, as a hand of a
+person does.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Results of a benchmark in a folder."""
+"""Results of a benchmark in a folder, OMPL's log of it, and the database for Planner Arena that is made of that."""
 
 from __future__ import annotations
 

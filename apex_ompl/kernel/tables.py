@@ -1,6 +1,7 @@
 """Tables of a robot and of a scene: their flat arrays with names, as files, and cut to some joints or pairs.
 
-Joints and covered bodies, by their specifications, are the input of a robot's tables.
+Joints and covered bodies, by their specifications, are the input of a robot's tables. What is read from files is
+checked here: compiled code trusts its arrays.
 """
 
 from __future__ import annotations

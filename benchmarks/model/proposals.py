@@ -48,12 +48,11 @@ from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import whole_number
 from benchmarks.lib import record
-from benchmarks.lib.controls import Shuffled, checkpoint_digest, digest, drawn, next_query
-from benchmarks.lib.neighbors import Neighbors
+from benchmarks.lib.controls import Neighbors, Shuffled, checkpoint_digest, digest, drawn, next_query
 
 ROOT = record.ROOT
 FOLDER = record.RESULTS.parent / "runs" / "proposals"
-DEPENDS = ("@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/neighbors.py")
+DEPENDS = ("@benchmark", "benchmarks/lib/controls.py")
 COUNTS = (1, 8, 32)
 GUIDED = Guidance(gamma=1.0)
 PAPER = Sampling("ddpm", 256)

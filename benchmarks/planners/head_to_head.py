@@ -36,7 +36,7 @@ from benchmarks.lib import record
 
 DEPENDS = (
     "@benchmark", "apex_ompl/baselines", "benchmarks/baselines", "benchmarks/lib/controls.py",
-    "benchmarks/lib/control_planners.py", "benchmarks/lib/neighbors.py",
+    "benchmarks/lib/control_planners.py",
 )  # fmt: skip
 FOLDER = Path(__file__).parents[1] / "runs" / "head_to_head"
 TIMEOUT = 10.0  # [s]

@@ -20,7 +20,7 @@ from benchmarks.lib import record
 from benchmarks.planners import head_to_head
 
 DEPENDS = (
-    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py", "benchmarks/lib/neighbors.py",
+    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py",
     "benchmarks/planners/head_to_head.py",
 )  # fmt: skip
 KINDS = ("hard", "large", "extreme")

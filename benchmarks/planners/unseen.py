@@ -31,7 +31,7 @@ from benchmarks.lib.controls import checkpoint_digest
 from benchmarks.planners.head_to_head import ROWS, TREELESS, together
 
 DEPENDS = (
-    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py", "benchmarks/lib/neighbors.py",
+    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py",
     "benchmarks/planners/head_to_head.py",
 )  # fmt: skip
 FOLDER = record.RESULTS.parent / "runs" / "unseen"
