@@ -1,4 +1,4 @@
-"""The tree of a robot's joints, the clusters of bodies that follow from it, and the balls around these and their parts."""
+"""The tree of a robot's joints, the clusters of bodies that follow from it, and balls around these and their parts."""
 
 from __future__ import annotations
 
