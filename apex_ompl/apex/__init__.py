@@ -16,5 +16,5 @@ __all__ = ["ApexParameters", "SolveContext", "Stage", "make_query"]
 
 __getattr__, __dir__ = lazy_names(
     __name__,
-    {"ApexParameters": "parameters", "SolveContext": "context", "Stage": "stages.stage", "make_query": "query"},
+    {"ApexParameters": "parameters", "SolveContext": "context", "Stage": "stages.stage", "make_query": "models"},
 )

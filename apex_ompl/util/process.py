@@ -21,7 +21,6 @@ from contextlib import contextmanager
 from itertools import pairwise
 
 from apex_ompl.util.forking import ProcessLock
-from apex_ompl.util.validation import check_integer
 
 PATIENCE = 20.0  # how long the interpreter waits for running work; the set-up of a planner ends by itself [s]
 LOOK = 0.01  # between two looks [s]
@@ -169,6 +168,8 @@ def in_threads(count: int, threads: int, call: Callable[[slice], None]) -> None:
     Raises:
         ParameterError: The number of threads is no positive whole number.
     """
+    from apex_ompl.util.validation import check_integer  # which imports NumPy
+
     parts = min(check_integer(threads, "threads", 1), max(count // PART, 1))
     if parts == 1:
         call(slice(count))
