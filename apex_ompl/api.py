@@ -174,7 +174,7 @@ def load_environment(problem: Problem | Environment | str | os.PathLike[str]) ->
         ApexError: It is unknown or faulty.
     """
     from apex_ompl.problems import worlds
-    from apex_ompl.problems.world_scripts import environment_of
+    from apex_ompl.problems.worlds import environment_of
 
     if isinstance(problem, Problem):
         return environment_of(problem)

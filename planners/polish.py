@@ -13,7 +13,7 @@ from ompl import geometric as og
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.ompl.own_planner import OwnPlanner
 from apex_ompl.ompl.parameters import Parameters, bounded, register
-from apex_ompl.ompl.simplify import simplify
+from apex_ompl.ompl.repair import simplify
 from apex_ompl.ompl.space import await_goal, path_to_array
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings

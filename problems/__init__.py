@@ -86,8 +86,7 @@ def sample(suite: str, *, level: str, seed: int) -> Problem:
         FileFormatError: The hash or the content of the file of a frozen problem is wrong.
     """
     from apex_ompl.problems import frozen
-    from apex_ompl.problems.catalogue import ProblemId
-    from apex_ompl.problems.generator import first_draw
+    from apex_ompl.problems.catalogue import ProblemId, first_draw
 
     problem_id = ProblemId(suite, level, seed)
     return frozen.load(problem_id).problem if frozen.is_frozen(problem_id) else first_draw(problem_id)[1]
@@ -111,8 +110,7 @@ def primitives(problem: Problem, *, enclosing: bool = False) -> tuple[Obstacle, 
     from apex_ompl.problems import frozen
     from apex_ompl.problems.broad import LEVELS
     from apex_ompl.problems.broad_representation import swollen
-    from apex_ompl.problems.catalogue import ProblemId
-    from apex_ompl.problems.generator import first_drawn
+    from apex_ompl.problems.catalogue import ProblemId, first_drawn
 
     problem_id = ProblemId.parse(problem.name) if is_id(problem.name) else None
     if problem_id is None or problem_id.suite not in LEVELS:

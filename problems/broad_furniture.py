@@ -6,6 +6,8 @@ cages, bottle crates, and boxes inside of boxes.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from apex_ompl.goals.state_sampling import Direction
@@ -26,6 +28,7 @@ from apex_ompl.problems.broad_parts import (
     grille,
     hollow_box,
     jitter,
+    joined,
     lattice,
     line,
     mirror,
@@ -107,18 +110,16 @@ def cabinet(rng: np.random.Generator) -> Composition:
     return Composition(parts, [Place(p, FORWARD) for p in points]).placed(raised)
 
 
-def tables(rng: np.random.Generator) -> Composition:
+@joined
+def tables(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw tables and stools under and beside each other, with objects on and beneath them."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 4))):
         x, y, height = rng.uniform(0.2, 0.5), rng.uniform(0.25, 0.7), rng.uniform(0.2, 0.6)
         pose = shift(rng.uniform(-0.15, 0.15), rng.uniform(-0.4, 0.4), 0) @ turn("z", rng.normal(0, 0.5))
         one = table(x, y, height, rng.uniform(0.01, 0.05), rng.uniform(0.015, 0.04))
         one += moved(stack(rng, int(rng.integers(1, 5)), 0.12), rng.uniform(-x, x) / 2, rng.uniform(-y, y) / 2, height)
         around = Composition(one, [at(0, rng.uniform(-y, y) / 2.5, 0.55 * height), at(0, 0, height + 0.12, DOWN)])
-        parts += around.placed(pose).parts
-        places += around.placed(pose).places
-    return Composition(parts, places)
+        yield around.placed(pose)
 
 
 def stairs(rng: np.random.Generator) -> Composition:
@@ -158,9 +159,9 @@ def bench(rng: np.random.Generator) -> Composition:
     return Composition(parts, [*places, at(-depth / 3, 0, height + 0.16, DOWN)])
 
 
-def chairs(rng: np.random.Generator) -> Composition:
+@joined
+def chairs(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw chairs that stand, lie, and are stacked upside down, the legs among each other."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(2, 5))):
         seat, height = rng.uniform(0.22, 0.35), rng.uniform(0.2, 0.35)
         chair = table(seat, seat, height, 0.02, 0.025)
@@ -172,15 +173,12 @@ def chairs(rng: np.random.Generator) -> Composition:
             "z", rng.normal(0, 2)
         )
         one = Composition(chair, [at(0, 0, height / 2), at(0, 0, height + 0.12)])
-        one = one.placed(pose @ turn("x", lying))
-        parts += one.parts
-        places += one.places
-    return Composition(parts, places)
+        yield one.placed(pose @ turn("x", lying))
 
 
-def crates(rng: np.random.Generator) -> Composition:
+@joined
+def crates(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw open boxes, upright and tilted, next to and above each other, with objects in them."""
-    parts, places = list[Part](), list[Place]()
     for k in range(int(rng.integers(2, 6))):
         x, y, z = rng.uniform(0.22, 0.36), rng.uniform(0.22, 0.36), rng.uniform(0.1, 0.36)
         side, fingers = (("near",), FORWARD) if rng.random() < 0.4 else (("top",), DOWN)
@@ -190,10 +188,7 @@ def crates(rng: np.random.Generator) -> Composition:
         mouth = np.array([-x / 2 if side == ("near",) else 0.0, 0.0, z / 2 if side == ("top",) else 0.0])
         inside = [Place(mouth * u, fingers) for u in (0.2, 0.6, 1.1)]
         pose = shift(rng.uniform(-0.12, 0.12), 0.36 * (k - 2) + rng.normal(0, 0.04), z / 2 + rng.choice([0.0, 0.3]))
-        one = Composition(crate, inside).placed(pose @ turn(rng.normal(size=3), rng.normal(0, 0.25)))
-        parts += one.parts
-        places += one.places
-    return Composition(parts, places)
+        yield Composition(crate, inside).placed(pose @ turn(rng.normal(size=3), rng.normal(0, 0.25)))
 
 
 def pigeonholes(rng: np.random.Generator) -> Composition:
@@ -214,9 +209,9 @@ def pigeonholes(rng: np.random.Generator) -> Composition:
     return Composition(parts, places).placed(raised)
 
 
-def barrels(rng: np.random.Generator) -> Composition:
+@joined
+def barrels(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw barrels of staves that stand, lie and lean, some with a bottom and with hoops."""
-    parts, places = list[Part](), list[Place]()
     for k in range(int(rng.integers(1, 4))):
         radius, length = rng.uniform(0.13, 0.2), rng.uniform(0.15, 0.4)
         barrel = tube(radius, length, rng.uniform(0.006, 0.02), int(rng.integers(7, 14)))
@@ -227,10 +222,7 @@ def barrels(rng: np.random.Generator) -> Composition:
         inside = [at(0, 0, z * length, DOWN) for z in (-0.1, 0.2, 0.5)]
         lying = turn("y", -rng.choice([0.0, 0.4, np.pi / 2]))  # its mouth to the front
         pose = shift(rng.uniform(-0.1, 0.1), 0.45 * (k - 1) + rng.normal(0, 0.05), length / 2 + rng.uniform(0, 0.2))
-        one = Composition(barrel, inside).placed(pose @ turn("z", rng.normal(0, 0.4)) @ lying)
-        parts += one.parts
-        places += one.places
-    return Composition(parts, places)
+        yield Composition(barrel, inside).placed(pose @ turn("z", rng.normal(0, 0.4)) @ lying)
 
 
 def cage(rng: np.random.Generator) -> Composition:

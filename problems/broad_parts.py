@@ -7,8 +7,9 @@ grilles, bent bars and sheets.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from typing import NamedTuple
 
 import numpy as np
@@ -408,6 +409,19 @@ class Composition:
         """Return the composition mirrored at the plane y = 0."""
         flip = np.diag([1.0, -1.0, 1.0, 1.0])
         return Composition(mirror(self.parts, 1), [_placed(flip, p) for p in self.places], self.stance)
+
+
+def joined(
+    draw: Callable[[np.random.Generator], Iterable[Composition]],
+) -> Callable[[np.random.Generator], Composition]:
+    """Return a function that draws one composition of all those that ``draw`` yields."""
+
+    @wraps(draw)
+    def drawn(rng: np.random.Generator) -> Composition:
+        found = list(draw(rng))
+        return Composition([p for one in found for p in one.parts], [p for one in found for p in one.places])
+
+    return drawn
 
 
 def _placed(pose: Array, one: Place) -> Place:

@@ -7,6 +7,8 @@ combine parts.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from apex_ompl.problems.broad_parts import (
@@ -31,6 +33,7 @@ from apex_ompl.problems.broad_parts import (
     grille,
     hollow_box,
     jitter,
+    joined,
     lattice,
     line,
     mirror,
@@ -140,9 +143,9 @@ def doorways(rng: np.random.Generator) -> Composition:
     return Composition(parts, places).placed(shift(-0.15, 0, rng.uniform(0.25, 0.6)) @ yaw)
 
 
-def lids(rng: np.random.Generator) -> Composition:
+@joined
+def lids(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw boxes with lids ajar, shelves that fold, and flaps, held open at odd angles."""
-    parts, places = list[Part](), list[Place]()
     for side in (-1, 1):
         x, y, z, thick = rng.uniform(0.25, 0.4), rng.uniform(0.28, 0.45), rng.uniform(0.15, 0.4), 0.01
         one = hollow_box(x, y, z, thick, ("top",))
@@ -151,9 +154,7 @@ def lids(rng: np.random.Generator) -> Composition:
             one += place(leaf, shift(far * x / 2, 0, z / 2 + thick) @ turn("y", far * rng.uniform(0.5, 2.5)))
         at_this = Composition(one, [at(0, 0, u * z, DOWN) for u in (-0.05, 0.25, 0.6)])
         pose = shift(rng.uniform(-0.1, 0.1), side * rng.uniform(0.22, 0.4), z / 2) @ turn("z", rng.normal(0, 0.6))
-        parts += at_this.placed(pose).parts
-        places += at_this.placed(pose).places
-    return Composition(parts, places)
+        yield at_this.placed(pose)
 
 
 def curtains(rng: np.random.Generator) -> Composition:
@@ -185,19 +186,16 @@ def shards(rng: np.random.Generator) -> Composition:
     return Composition(parts, places, FLOATING)
 
 
-def arches(rng: np.random.Generator) -> Composition:
+@joined
+def arches(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw arches of boxes in a row, or crossing, to reach under and over."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 5))):
         radius, thick = rng.uniform(0.15, 0.4), rng.uniform(0.01, 0.05)
         arch = bent_sheet(arc(radius, 0.0, np.pi, int(rng.integers(6, 12))), rng.uniform(0.02, 0.25), thick)
         pose = shift(rng.uniform(-0.2, 0.2), rng.uniform(-0.35, 0.35), rng.uniform(0, 0.15)) @ turn(
             "z", np.pi / 2 + rng.normal(0, 0.6)
         )
-        one = Composition(arch, [at(0, 0, 0.55 * radius), at(0, 0, radius + 0.12, DOWN)]).placed(pose)
-        parts += one.parts
-        places += one.places
-    return Composition(parts, places)
+        yield Composition(arch, [at(0, 0, 0.55 * radius), at(0, 0, radius + 0.12, DOWN)]).placed(pose)
 
 
 def hoops(rng: np.random.Generator) -> Composition:
@@ -233,18 +231,15 @@ def domes(rng: np.random.Generator) -> Composition:
     return Composition(parts, places).placed(shift(0, 0, rng.uniform(0, 0.15)))
 
 
-def gutters(rng: np.random.Generator) -> Composition:
+@joined
+def gutters(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw half pipes, troughs and cradles, open upwards, downwards or to the front."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 4))):
         radius, length = rng.uniform(0.13, 0.25), rng.uniform(0.25, 0.8)
         half = tube(radius, length, rng.uniform(0.004, 0.02), 8, np.pi * rng.uniform(0.8, 1.4))
         one = Composition(half, [at(-0.02, 0, u * length) for u in (-0.3, 0.0, 0.3)])
         pose = shift(rng.uniform(-0.15, 0.15), rng.uniform(-0.4, 0.4), rng.uniform(0.15, 0.6))
-        one = one.placed(pose @ turn("x", np.pi / 2 + rng.normal(0, 0.4)) @ turn("z", rng.uniform(0, 2 * np.pi)))
-        parts += one.parts
-        places += one.places
-    return Composition(parts, places)
+        yield one.placed(pose @ turn("x", np.pi / 2 + rng.normal(0, 0.4)) @ turn("z", rng.uniform(0, 2 * np.pi)))
 
 
 def hooks(rng: np.random.Generator) -> Composition:
@@ -262,9 +257,9 @@ def hooks(rng: np.random.Generator) -> Composition:
     return Composition(parts, places)
 
 
-def bowls(rng: np.random.Generator) -> Composition:
+@joined
+def bowls(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw bowls and funnels of tilted plates around an axis, upright, tipped over or upside down."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 4))):
         radius, height, slope = rng.uniform(0.13, 0.2), rng.uniform(0.12, 0.28), rng.uniform(0.1, 0.7)
         count = int(rng.integers(8, 13))
@@ -275,10 +270,7 @@ def bowls(rng: np.random.Generator) -> Composition:
         one = Composition(bowl, [at(0, 0, u * height, DOWN) for u in (0.0, 0.4, 0.9)], FLOATING)
         pose = shift(rng.uniform(-0.1, 0.1), rng.uniform(-0.45, 0.45), height / 2 + rng.choice([0.02, 0.3]))
         tipped = turn("y", -float(rng.choice([0.0, 0.3, np.pi / 2])))
-        one = one.placed(pose @ turn("z", rng.normal(0, 0.8)) @ tipped)
-        parts += one.parts
-        places += one.places
-    return Composition(parts, places)
+        yield one.placed(pose @ turn("z", rng.normal(0, 0.8)) @ tipped)
 
 
 def solid(rng: np.random.Generator, low: float, high: float) -> Parts:

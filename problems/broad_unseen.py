@@ -11,6 +11,8 @@ triangles (``truss``), hexagonal cells (``honeycomb``) and brushes of needles (`
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from apex_ompl.problems.broad_parts import (
@@ -29,6 +31,7 @@ from apex_ompl.problems.broad_parts import (
     circle,
     fan,
     hollow_box,
+    joined,
     moved,
     place,
     places_at,
@@ -133,9 +136,9 @@ def tree(rng: np.random.Generator) -> Composition:
     return Composition(parts, places)
 
 
-def spiral(rng: np.random.Generator) -> Composition:
+@joined
+def spiral(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw helices: springs along any axis that hands are inside of, cones, and stairs that wind around a post."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 4))):
         radius, turns, rise = rng.uniform(0.14, 0.25), rng.uniform(1.5, 3.5), rng.uniform(0.12, 0.28)
         angle = np.linspace(0.0, 2 * np.pi * turns, int(14 * turns))
@@ -154,15 +157,12 @@ def spiral(rng: np.random.Generator) -> Composition:
         inside = [at(0, 0, h, DOWN) for h in rng.uniform(0, z[-1], 2)] + [at(radius + 0.1, 0, z[-1] / 2)]
         pose = shift(rng.uniform(-0.1, 0.1), rng.uniform(-0.45, 0.45), rng.uniform(0.02, 0.3))
         lying = turn("y", float(rng.choice([0.0, 0.0, 0.5, -np.pi / 2]))) @ turn("z", rng.uniform(0, 6))
-        found = Composition(one, inside).placed(pose @ lying)
-        parts += found.parts
-        places += found.places
-    return Composition(parts, places)
+        yield Composition(one, inside).placed(pose @ lying)
 
 
-def net(rng: np.random.Generator) -> Composition:
+@joined
+def net(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw sagging nets and hammocks of thin ropes between posts, torn here and there, level or upright."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 3))):
         width, depth, sag = rng.uniform(0.5, 1.1), rng.uniform(0.3, 0.5), rng.uniform(0.02, 0.3)
         rows, columns, radius = int(rng.integers(3, 6)), int(rng.integers(4, 8)), rng.uniform(0.003, 0.008)
@@ -184,10 +184,7 @@ def net(rng: np.random.Generator) -> Composition:
         ways += places_at(chosen + (0, 0, 0.15), DOWN)
         tilt = turn("y", -np.pi / 2 + rng.normal(0, 0.3)) if upright else turn("y", rng.normal(0, 0.2))
         pose = shift(rng.uniform(-0.1, 0.15), rng.normal(0, 0.15), rng.uniform(0.35, 0.75))
-        found = Composition(one, ways).placed(pose @ tilt)
-        parts += found.parts
-        places += found.places
-    return Composition(parts, places)
+        yield Composition(one, ways).placed(pose @ tilt)
 
 
 def machine(rng: np.random.Generator) -> Composition:
@@ -262,9 +259,9 @@ def blades(rng: np.random.Generator) -> Composition:
     return Composition(parts, places, FLOATING)
 
 
-def wheels(rng: np.random.Generator) -> Composition:
+@joined
+def wheels(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw discs and wheels with spokes on axles, the hands between the spokes and beside the rims."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 4))):
         radius, spokes, rim = rng.uniform(0.2, 0.4), int(rng.integers(3, 7)), rng.uniform(0.008, 0.03)
         wheel = ring(radius, rim, 14)
@@ -275,15 +272,12 @@ def wheels(rng: np.random.Generator) -> Composition:
         gap = 0.62 * radius * np.array([0.0, np.cos(angle), np.sin(angle)])
         pose = shift(rng.uniform(-0.15, 0.15), rng.uniform(-0.45, 0.45), rng.uniform(0.3, 0.6))
         one = Composition(wheel, [Place(gap + (x, 0, 0), FORWARD) for x in (-0.1, 0.04)])
-        one = one.placed(pose @ turn("z", rng.normal(0, 0.6)) @ turn("x", rng.uniform(0, 2 * np.pi)))
-        parts += one.parts
-        places += one.places
-    return Composition(parts, places)
+        yield one.placed(pose @ turn("z", rng.normal(0, 0.6)) @ turn("x", rng.uniform(0, 2 * np.pi)))
 
 
-def truss(rng: np.random.Generator) -> Composition:
+@joined
+def truss(rng: np.random.Generator) -> Iterator[Composition]:
     """Draw girders of triangles, three chords each, that stand, span and lean; hands reach between their bars."""
-    parts, places = list[Part](), list[Place]()
     for _ in range(int(rng.integers(1, 5))):
         radius, bays, bay = rng.uniform(0.1, 0.22), int(rng.integers(2, 6)), rng.uniform(0.18, 0.32)
         bar, chord = rng.uniform(0.004, 0.01), rng.uniform(0.008, 0.016)
@@ -299,10 +293,7 @@ def truss(rng: np.random.Generator) -> Composition:
         inside = [at(0.0, 0.0, z) for z in (levels[:-1] + levels[1:]) / 2] + [at(radius + 0.1, 0.0, 0.0)]
         pose = shift(*rng.uniform((-0.15, -0.5, 0.2), (0.25, 0.5, 0.7)))
         leaning = random_turn(rng) if rng.random() < 0.4 else turn("x", float(rng.choice([0.0, np.pi / 2])))
-        found = Composition(one, inside).placed(pose @ leaning)
-        parts += found.parts
-        places += found.places
-    return Composition(parts, places)
+        yield Composition(one, inside).placed(pose @ leaning)
 
 
 def honeycomb(rng: np.random.Generator) -> Composition:

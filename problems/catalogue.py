@@ -1,13 +1,22 @@
-"""The suites and their levels, the splits of seeds, and the ids of problems."""
+"""The suites and their levels, the splits of seeds, the ids of problems, and the drawing of a problem by its id.
+
+One id gives the same problem on every machine and in every process.
+"""
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from apex_ompl.errors import ParameterError
+from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.goals.state_sampling import HandPoseSampler
 from apex_ompl.problems import ID, alignment, broad, scenes
+from apex_ompl.problems.broad import GRAMMARS, SUITE
+from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, empty_hand_tables, robot
+from apex_ompl.scene.problem import Problem
 from apex_ompl.util.validation import check_name
 
 SPLITS = {"train": range(800_000), "validation": range(800_000, 900_000), "test": range(900_000, 1_000_000)}
@@ -82,3 +91,58 @@ class ProblemId:
         """
         match = ID.fullmatch(text)
         return None if match is None else cls(match[1], match[2], int(match[3]))
+
+
+SYNERGIES = (0.0, 0.4)  # interval of the synergies of empty hands
+MAX_DRAWS = 300  # for one id, before it is abandoned
+
+
+class SuiteError(ApexError):
+    """A problem of a suite that cannot be drawn."""
+
+
+def draw(problem_id: ProblemId, number: int) -> DrawnProblem | None:
+    """Return draw ``number`` of a problem, or None when that draw has no start or no goal."""
+    level_hash = zlib.crc32(f"{problem_id.suite}/{problem_id.level}".encode())
+    rng = np.random.default_rng([level_hash, problem_id.seed, number])
+    if problem_id.suite in alignment.SAMPLERS:
+        return alignment.draw(rng, problem_id.suite, problem_id.level)
+    if problem_id.suite == SUITE and problem_id.level in broad.SIMPLE_LEVELS:
+        return broad.draw_simple(rng, problem_id.level, SYNERGIES)
+    if problem_id.suite in GRAMMARS:
+        return broad.draw(rng, problem_id.suite, problem_id.level)
+    task = scenes.SUITES[problem_id.suite](rng, problem_id.level)
+    poses = HandPoseSampler(empty_hand_tables(), task.scene, MARGIN)
+    start = poses.sample(rng, task.start, SYNERGIES)
+    goal = None if start is None else poses.sample(rng, task.goal, SYNERGIES)
+    return None if start is None or goal is None else DrawnProblem(task.scene, start, goal)
+
+
+@lru_cache(maxsize=64)
+def _first_drawn(problem_id: ProblemId, after: int) -> tuple[int, DrawnProblem]:
+    for number in range(after + 1, MAX_DRAWS):
+        drawn = draw(problem_id, number)
+        if drawn is not None:
+            return number, drawn
+    raise SuiteError(f"problem {problem_id}: none of {MAX_DRAWS} draws has a start and a goal")
+
+
+def first_drawn(problem_id: ProblemId, after: int = -1) -> tuple[int, DrawnProblem]:
+    """Return number and drawn problem of the first draw after ``after`` that has a start and a goal.
+
+    The last results are cached.
+
+    Raises:
+        SuiteError: None of the first ``MAX_DRAWS`` draws has.
+    """
+    return _first_drawn(problem_id, after)  # one form of the arguments, which are the key of the cache
+
+
+def first_draw(problem_id: ProblemId, after: int = -1) -> tuple[int, Problem]:
+    """Return the number and the problem of the first draw after ``after`` that has a start and a goal.
+
+    Raises:
+        SuiteError: None of the first ``MAX_DRAWS`` draws has.
+    """
+    number, drawn = first_drawn(problem_id, after)
+    return number, drawn.to_problem(str(problem_id), robot())

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from apex_ompl.problems.generator import SuiteError
+from apex_ompl.problems.catalogue import SuiteError
 from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
-from apex_ompl.problems.world_scripts import ScriptedEnvironment
+from apex_ompl.problems.worlds import ScriptedEnvironment
 from apex_ompl.scene.bodies import Obstacle, PlaceInTime
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import row_of

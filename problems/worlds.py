@@ -11,11 +11,12 @@ into those for training, validation and tests as the suites' are.
 - ``interceptor``: a cube at constant velocity would meet the first motion (the same module).
 - ``turning``: a cube takes a new direction every .5 to 2 s (:mod:`apex_ompl.problems.world_wanderers`).
 - ``crowd``: three cubes cross in front of the robot (the same module).
-- ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_pusher`).
+- ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_ambushes`).
 """
 
 from __future__ import annotations
 
+import math
 import re
 import zlib
 from abc import ABC, abstractmethod
@@ -31,10 +32,11 @@ from apex_ompl.problems.alignment import SAMPLERS, SIZES
 from apex_ompl.problems.catalogue import MOVING, SPLITS, ProblemId
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import fastest, is_there, obstacle_at, recorded
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
-from apex_ompl.util.validation import check_integer, check_name
+from apex_ompl.util.validation import check_integer, check_name, check_number
 
 MOVING_KIND = "moving"
 GENERATED = ("popup", "interceptor", "turning", "crowd", "pusher")
@@ -76,6 +78,65 @@ class DynamicEnvironment(ABC):
     @abstractmethod
     def script(self) -> tuple[Obstacle, ...]:
         """Return what the moving obstacles did up to the last step: obstacles with ``trajectory`` and ``appears``."""
+
+
+class ScriptedEnvironment(DynamicEnvironment):
+    """An environment of obstacles with a velocity or a script.
+
+    Attributes:
+        foreseen: Time up to which ``present`` may be asked, besides the last step [s]; infinite where all is fixed.
+    """
+
+    foreseen: float = math.inf
+
+    def __init__(self, name: str, problem: Problem, obstacles: tuple[Obstacle, ...], fastest: float) -> None:
+        """Make an environment.
+
+        Args:
+            name: Its name.
+            problem: Static obstacles, start and goal.
+            obstacles: Moving obstacles, from time 0 on.
+            fastest: Their largest speed [m/s].
+        """
+        self.name, self.problem, self.fastest = name, problem, fastest
+        self._obstacles = obstacles
+        self._now = 0.0
+
+    def start(self, motion: Trajectory, time: float) -> None:
+        """Take the first motion, and when it starts [s].
+
+        Raises:
+            ParameterError: The time is before the last step.
+        """
+        check_number(time, "time", self._now)
+
+    def advance(self, time: float, q: Array) -> None:
+        """Take the robot's state, shape (dof,), at a time [s].
+
+        Raises:
+            ParameterError: The time is before the last step.
+        """
+        check_number(time, "time", self._now)
+        self._now = float(time)
+
+    def present(self, time: float) -> tuple[Obstacle, ...]:
+        """Return the moving obstacles that are there at a time [s], where they are then, with their velocities.
+
+        Before time 0 obstacles of constant velocity move, and scripts stand.
+
+        Raises:
+            ParameterError: It is not decided yet what will be then.
+        """
+        check_number(time, "time", high=max(self._now, self.foreseen))
+        return tuple(obstacle_at(o, time) for o in self._until(time) if is_there(o, time))
+
+    def script(self) -> tuple[Obstacle, ...]:
+        """Return what the moving obstacles did up to the last step."""
+        return tuple(recorded(o, self._now) for o in self._until(self._now) if is_there(o, self._now))
+
+    def _until(self, time: float) -> tuple[Obstacle, ...]:
+        """Return the obstacles, with scripts that last longer than up to a time [s]; of wanderers overridden."""
+        return self._obstacles
 
 
 @dataclass(frozen=True)
@@ -155,6 +216,21 @@ def ids(kind: str, split: str, count: int) -> tuple[str, ...]:
     return tuple(name if kind == MOVING_KIND else f"{kind}/{name}" for name in islice(every, count))
 
 
+def environment_of(problem: Problem) -> ScriptedEnvironment:
+    """Return the environment of a problem's own obstacles, which move by their records whatever the robot does.
+
+    Obstacles with a velocity move for ever.
+
+    Raises:
+        ParameterError: A pair of bodies that may touch names an obstacle that moves.
+    """
+    touching = next((pair for pair in problem.allowed if {*pair} & {*problem.moving}), None)
+    if touching is not None:
+        raise ParameterError("allowed", touching, "no obstacle that moves in a pair that may touch")
+    dynamic = tuple(o for o in problem.scene if o.moving)
+    return ScriptedEnvironment(problem.name, problem.still, dynamic, max(map(fastest, dynamic), default=0.0))
+
+
 def load(name: str) -> DynamicEnvironment:
     """Return a world, new at each call, by its name, that of a problem, or a problem file.
 
@@ -164,8 +240,6 @@ def load(name: str) -> DynamicEnvironment:
         SuiteError: No problem or no place for a cube can be drawn for that seed.
         ApexError: A problem file, or a file that it names, is faulty.
     """
-    from apex_ompl.problems.world_scripts import environment_of
-
     kind, *rest = name.split("/")
     if name.endswith((".yaml", ".yml")) or Path(name).is_absolute():
         return environment_of(Problem.load(name))
@@ -179,8 +253,7 @@ def load(name: str) -> DynamicEnvironment:
 
 def _drawn(world: WorldId) -> DynamicEnvironment:
     """Return the world of an id."""
-    from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment
-    from apex_ompl.problems.world_pusher import PusherEnvironment
+    from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment, PusherEnvironment
     from apex_ompl.problems.world_wanderers import WanderersEnvironment
 
     level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())

@@ -15,8 +15,7 @@ from apex_ompl.moving.timed_proof import check_timed_path
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.problems import frozen
-from apex_ompl.problems.catalogue import ProblemId
-from apex_ompl.problems.generator import first_draw
+from apex_ompl.problems.catalogue import ProblemId, first_draw
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import whole_number

@@ -35,9 +35,8 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import SEARCH_RESOLUTION, states_between
 from apex_ompl.problems import frozen
 from apex_ompl.problems.alignment import VELOCITY_SCALE, straight_line_duration
-from apex_ompl.problems.catalogue import VALIDATION, ProblemId
+from apex_ompl.problems.catalogue import VALIDATION, ProblemId, first_drawn
 from apex_ompl.problems.frozen import FrozenProblem, Witness
-from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at

@@ -1,5 +1,10 @@
 from __future__ import annotations
 
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: two processes of tests share the cores
+
+import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -10,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import settings as hypothesis_settings
 from planning import HARD, cached_problem
-from support import DATA
+from support import DATA, ROOT
 
 from apex_ompl import plan
 from apex_ompl.cli import main
@@ -78,6 +83,24 @@ def apex_cli(capfd: pytest.CaptureFixture[str]):
             code = int(ended.code or 0)
         finally:
             sys.stdout = stdout
+        return subprocess.CompletedProcess(arguments, code, *capfd.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def script_here(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """Run a script of ``scripts`` in this process; returns exit code, standard output and standard error."""
+
+    def run(script: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        file = str(ROOT / "scripts" / script)
+        capfd.readouterr()
+        monkeypatch.setattr(sys, "argv", [file, *map(str, arguments)])
+        code = 0
+        try:
+            runpy.run_path(file, run_name="__main__")
+        except SystemExit as ended:
+            code = int(ended.code or 0)
         return subprocess.CompletedProcess(arguments, code, *capfd.readouterr())
 
     return run

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from ompl import base as ob
 
+from apex_ompl.apex.models import make_query, rough_kernel
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.query import make_query, rough_kernel
 from apex_ompl.ompl.own_planner import SolveReport
 from apex_ompl.paths.candidates import Candidate, CandidatePool
 from apex_ompl.paths.optimizer import Optimizer
@@ -20,8 +20,8 @@ from apex_ompl.types import Array
 if TYPE_CHECKING:
     from ompl import geometric as og
 
-    from apex_ompl.apex.sampler import ProposalSampler
-    from apex_ompl.apex.trees import OmplTrees
+    from apex_ompl.apex.models import ProposalSampler
+    from apex_ompl.apex.stages.trees import OmplTrees
     from apex_ompl.kernel.search import SearchCounts, TreePair
     from apex_ompl.model.query import Query
 

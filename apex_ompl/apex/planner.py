@@ -13,16 +13,22 @@ from ompl import geometric as og
 from ompl import util as ou
 
 from apex_ompl.apex.context import SolveContext
-from apex_ompl.apex.models import Model, trajectory_model
+from apex_ompl.apex.models import Model, ProposalSampler, make_query, trajectory_model
 from apex_ompl.apex.parameters import AUTO, NAME, ApexKeywords, ApexParameters
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.query import make_query
-from apex_ompl.apex.sampler import ProposalSampler
 from apex_ompl.apex.stages import Anytime, Shorten, Solution, Stage, run_stage
-from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.search import TreePair, shortcut
-from apex_ompl.ompl.own_planner import LOG, OwnPlanner, SolveReport, Status, Tree
+from apex_ompl.ompl.own_planner import (
+    LOG,
+    OwnPlanner,
+    SolveReport,
+    Status,
+    Tree,
+    nearest_pairs,
+    read_goals,
+    read_starts,
+)
 from apex_ompl.ompl.space import array_to_path
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import SEARCH_RESOLUTION

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.tables import make_tables, primitives, stored_tables
-from apex_ompl.kernel.ahead_of_time import compile_for_plans
 from apex_ompl.kernel.kernel import COLLIDES, MOST_PAIRS, Kernel, PathCheck
+from apex_ompl.kernel.library import compile_for_plans
 from apex_ompl.kernel.scene_builder import Solids, moved, tables_of
 from apex_ompl.kernel.tables import RobotTables, SceneTables
 from apex_ompl.robot import Robot

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from weakref import WeakKeyDictionary
@@ -24,6 +24,7 @@ from apex_ompl.util.forking import ProcessLock
 
 Manager = pin.BroadPhaseManager_DynamicAABBTreeCollisionManager
 Pair = tuple[int, int]
+BOX_SLACK = ((-1e-6,) * 3, (1e-6,) * 3)  # grows boxes, so that no contact is missed by rounding [m]
 
 
 @dataclass(frozen=True)
@@ -245,14 +246,18 @@ class MeshStage:
     def _near(self) -> Iterator[Pair]:
         """Yield the pairs with held objects or obstacles whose boxes overlap at the current placements."""
         moving, obstacles = self.moving, list(self.scene.values())
-        solids = [self.solids[k] for k in moving]
-        boxes = world_boxes(solids, [self._pose(solid) for solid in solids])
-        there = [self.solids[k] for k in obstacles]
-        meets = overlaps(boxes, world_boxes(there, [solid.placement for solid in there]))
-        for i, j in np.argwhere(meets).tolist():
+        bodies = [*moving, *(k for k in range(self.links) if self.solids[k].joint == 0)]
+        boxes = self._boxes(bodies)
+        for i, j in np.argwhere(overlaps(boxes[: len(moving)], self._boxes(obstacles))).tolist():
             if not self._may_touch(moving[i], obstacles[j]):
                 yield moving[i], obstacles[j]
-        yield from self._held_pairs()
+        near, row = overlaps(boxes + BOX_SLACK, boxes), {number: k for k, number in enumerate(bodies)}
+        yield from ((i, j) for i, j in self._held_pairs() if near[row[i], row[j]])
+
+    def _boxes(self, numbers: Sequence[int]) -> Array:
+        """Return the boxes around solids at the current placements, shape (n, 2, 3) [m]."""
+        solids = [self.solids[k] for k in numbers]
+        return world_boxes(solids, [self._pose(solid) for solid in solids])
 
     def _depth(self, first: Solid, second: Solid) -> float:
         """Return how deep two solids overlap at the current placements: their hulls, or the balls of a cloud."""

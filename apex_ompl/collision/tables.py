@@ -45,9 +45,8 @@ from apex_ompl.kernel.arrays import (
 from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_builder import robot_tables
-from apex_ompl.kernel.robot_specs import BodySpec, JointSpec, no_balls
 from apex_ompl.kernel.scene_builder import Primitive
-from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.tables import BodySpec, JointSpec, RobotTables, no_balls
 from apex_ompl.robot import Robot
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array

@@ -16,8 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from apex_ompl.errors import FileFormatError
-from apex_ompl.evaluation.log import short
-from apex_ompl.evaluation.results import Results
+from apex_ompl.evaluation.results import Results, short
 from apex_ompl.evaluation.summary import Statistics, about, statistics, tables, warnings
 from apex_ompl.util.files import make_folder, write_atomically
 

@@ -29,7 +29,7 @@ from apex_ompl.paths.path import path_length
 from apex_ompl.planning import PlanQuery, among_dynamic_obstacles, steps
 from apex_ompl.planning.among_dynamic_obstacles import STAGES
 from apex_ompl.planning.query import dynamic_of
-from apex_ompl.problems.generator import SuiteError
+from apex_ompl.problems.catalogue import SuiteError
 from apex_ompl.result import FIRST, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.problem import Problem

@@ -14,9 +14,9 @@ from apex_ompl.kernel.compiled.check import motion_proof, queries, separation
 from apex_ompl.kernel.compiled.robot.kinematics import joint_pushes
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.tables import RobotTables, SceneTables
-from apex_ompl.kernel.threads import in_threads
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
+from apex_ompl.util.process import in_threads
 from apex_ompl.util.validation import number_array, shape_error
 
 MOST_PAIRS = 16  # pairs that are listed for one state

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.cluster_balls import ClusterBall, Member, transformed
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, LIMIT_SLACK, RobotArrays
-from apex_ompl.kernel.joint_tree import JointTree
+from apex_ompl.kernel.joint_tree import ClusterBall, JointTree, Member, transformed
 from apex_ompl.kernel.products import product
-from apex_ompl.kernel.robot_specs import BodySpec
-from apex_ompl.kernel.tables import RobotTables, pair_runs
+from apex_ompl.kernel.tables import BodySpec, RobotTables, pair_runs
 from apex_ompl.types import Array
 
 PairRow = tuple[tuple[int, int], int, list[tuple[int, int]]]

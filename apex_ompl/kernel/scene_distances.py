@@ -9,9 +9,9 @@ from apex_ompl.kernel.compiled.arrays import GRID_ROW, SceneArrays
 from apex_ompl.kernel.compiled.geometry import scene_distance
 from apex_ompl.kernel.compiled.layout import Integers, pack
 from apex_ompl.kernel.tables import SceneTables
-from apex_ompl.kernel.threads import in_threads
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
+from apex_ompl.util.process import in_threads
 from apex_ompl.util.validation import shape_error
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import Curve
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.ahead_of_time import compile_for_runs
+from apex_ompl.kernel.library import compile_for_runs
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
 from apex_ompl.moving.settings import LoopSettings

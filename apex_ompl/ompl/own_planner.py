@@ -1,4 +1,4 @@
-"""Base class of this package's OMPL planners, and the report that each makes."""
+"""Base class of this package's OMPL planners, the report that each makes, and the starts and goals that they read."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.errors import ApexError
-from apex_ompl.ompl.space import array_to_path, forget_states, to_state
+from apex_ompl.ompl.space import array_to_path, await_goal, forget_states, to_array, to_state
 from apex_ompl.paths.path import Path
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
@@ -169,6 +170,17 @@ class OwnPlanner(ob.Planner):
         """Solve the problem, and return OMPL's status."""
         raise NotImplementedError
 
+    def _ends(self, ptc: ob.PlannerTerminationCondition) -> tuple[list[Array], list[Array], Any]:
+        """Return the valid starts and goals, each of shape (dof,), and a status where there are none, else None."""
+        inputs, dof = self.getPlannerInputStates(), int(self.getSpaceInformation().getStateDimension())
+        starts, goals = read_starts(inputs, dof), read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
+        if starts and goals:
+            return starts, goals, None
+        self.report.reason = "no valid goal state was sampled" if starts else "no start state is valid"
+        if not starts:
+            return starts, goals, Status.INVALID_START
+        return starts, goals, Status.TIMEOUT if ptc() else Status.INVALID_GOAL
+
     def clear(self) -> None:
         """Forget the last solution."""
         super().clear()
@@ -213,3 +225,64 @@ class OwnPlanner(ob.Planner):
     def _trees(self) -> list[Tree]:
         """Return the trees of the last call of ``solve``."""
         return []
+
+
+MAX_GOALS, GOAL_ATTEMPTS = 8, 32  # goals that are read of a region, and samples that are drawn for them
+MAX_STATES = 256  # states of a goal that has no more, all of which are read
+MAX_PAIRS = 8  # pairs of start and goal that proposals are made for
+
+
+def read_starts(inputs: Any, dof: int) -> list[Array]:
+    """Return the valid start states, each of shape (dof,).
+
+    Args:
+        inputs: The planner's ``getPlannerInputStates()``.
+        dof: Number of joints.
+    """
+    found = []
+    inputs.restart()
+    while inputs.haveMoreStartStates():
+        state = inputs.nextStart()
+        if state is None:
+            break
+        found.append(to_array(state, dof))
+    return _distinct(found)
+
+
+def read_goals(inputs: Any, dof: int, ptc: ob.PlannerTerminationCondition, goal: Any) -> list[Array]:
+    """Return the valid goal states, each of shape (dof,), or a few where there are many, or the goal is a region.
+
+    Args:
+        inputs: The planner's ``getPlannerInputStates()``.
+        dof: Number of joints.
+        ptc: Ends the sampling of a region.
+        goal: The goal.
+    """
+    found = []
+    sampled = goal is not None and goal.hasType(ob.GOAL_SAMPLEABLE_REGION)
+    count = goal.maxSampleCount() if sampled else 0
+    most, attempts = (count, count) if MAX_GOALS < count <= MAX_STATES else (MAX_GOALS, GOAL_ATTEMPTS)
+    await_goal(goal, ptc)
+    state = inputs.nextGoal(ptc)
+    for _ in range(attempts):
+        if state is not None:
+            found.append(to_array(state, dof))
+        if len(found) == most or ptc() or not inputs.haveMoreGoalStates():
+            break
+        state = inputs.nextGoal()  # None where the next sample is invalid
+    return _distinct(found)
+
+
+def nearest_pairs(starts: list[Array], goals: list[Array]) -> list[tuple[Array, Array]]:
+    """Return the pairs of start and goal that are nearest to each other, the nearest first."""
+    pairs = product(starts, goals)
+    return sorted(pairs, key=lambda pair: float(np.linalg.norm(pair[1] - pair[0])))[:MAX_PAIRS]
+
+
+def _distinct(states: list[Array]) -> list[Array]:
+    """Return the finite states, each once."""
+    found: list[Array] = []
+    for state in states:
+        if np.isfinite(state).all() and not any(np.array_equal(state, other) for other in found):
+            found.append(state)
+    return found

@@ -1,28 +1,67 @@
-"""Repair of paths that pass the search resolution and fail the full check."""
+"""Shortening of paths, and repair of those that pass the search resolution and fail the full check."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 
 import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.ompl.interrupt import Interrupt, ends_after
+from apex_ompl.ompl.process import Interrupt, ends_after
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.simple_setup import SimpleSetup
-from apex_ompl.ompl.space import path_to_array, to_state
+from apex_ompl.ompl.space import array_to_path, path_to_array, to_state
 from apex_ompl.ompl.validity import (
     FullCheck,
     MotionProof,
     MotionValidator,
     StateValidityChecker,
+    forwarding,
     full_check,
     motions_until,
 )
-from apex_ompl.paths.path import Path
+from apex_ompl.paths.path import Path, path_length
 from apex_ompl.types import Array
+
+ROUNDS = 6
+MIN_GAIN = 0.01  # a round that shortens by less than this share is the last
+
+
+def simplify(si: ob.SpaceInformation, path: Array, stop: Callable[[], bool] = lambda: False) -> Array:
+    """Return a shorter path with the same ends, by OMPL's vertex reduction and partial shortcuts.
+
+    Rounds are counted, never timed, so that the same seed gives the same path.
+
+    Motions are checked by the motion validator of ``si``.
+
+    Args:
+        si: OMPL's space information of the problem.
+        path: States, shape (N, dof).
+        stop: Asked whether to end before every round, and before every motion that is checked.
+    """
+    if len(path) < 3:
+        return path
+    validator = si.getMotionValidator()
+    watched = si if isinstance(validator, MotionValidator) else forwarding(si, stop=stop)
+    simplifier, work, best = og.PathSimplifier(watched), array_to_path(watched, path), path
+    with motions_until(validator, stop) if isinstance(validator, MotionValidator) else nullcontext():
+        for _ in range(ROUNDS):
+            if stop():
+                break
+            simplifier.reduceVertices(work)
+            simplifier.partialShortcutPath(work)
+            states = path_to_array(work, path.shape[1])
+            gain = 1.0 - path_length(states) / max(path_length(best), 1e-12)
+            if gain > 0.0:
+                best = states
+            if gain < MIN_GAIN:
+                break
+    return np.concatenate([path[:1], best[1:-1], path[-1:]])
+
 
 MAX_BRIDGES = 20
 RANGE = 1.0  # of the trees, as tuned for rrtconnect [rad]

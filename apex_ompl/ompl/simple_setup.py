@@ -8,7 +8,7 @@ from typing import Any
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.ompl.interrupt import ends_after
+from apex_ompl.ompl.process import ends_after
 from apex_ompl.ompl.space import Bounds, await_goal, state_space
 from apex_ompl.robot import Robot
 from apex_ompl.util.process import running

@@ -258,8 +258,7 @@ class MotionPlanner:
         from apex_ompl.apex.models import has_model
         from apex_ompl.apex.parameters import NAME
         from apex_ompl.collision.conservative import CheckCounts
-        from apex_ompl.ompl.interrupt import Interrupt
-        from apex_ompl.ompl.process import quiet_ompl
+        from apex_ompl.ompl.process import Interrupt, quiet_ompl
         from apex_ompl.planning import steps
         from apex_ompl.planning.departure import departed, with_departure
         from apex_ompl.planning.query import dynamic_of, snapshot_notes

@@ -29,12 +29,11 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.errors import ApexError, TimingError, TimingStoppedError
 from apex_ompl.ompl import setup as ompl_setup
-from apex_ompl.ompl.interrupt import MAX_TIME, Interrupt, ends_after
 from apex_ompl.ompl.own_planner import SolveReport, reporting
-from apex_ompl.ompl.process import quiet_ompl, seed_ompl
+from apex_ompl.ompl.process import MAX_TIME, Interrupt, ends_after, quiet_ompl, seed_ompl
 from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.repair import simplify as shorten
 from apex_ompl.ompl.setup import PlanningSetup, set_goals
-from apex_ompl.ompl.simplify import simplify as shorten
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
 from apex_ompl.paths.path import Path

@@ -24,8 +24,57 @@ Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
 
 
+class MirrorConfig(StrictModel):
+    """Mirror symmetry of a robot, see ``apex_ompl.training.data.Mirror``; one number for each joint."""
+
+    order: tuple[Annotated[int, Field(ge=0)], ...]
+    sign: tuple[Literal[-1, 1], ...]
+    shift: tuple[float, ...]
+
+    @model_validator(mode="after")
+    def _fits(self) -> MirrorConfig:
+        count = len(self.order)
+        if not len(self.sign) == len(self.shift) == count or sorted(self.order) != list(range(count)):
+            raise ValueError("expected every joint's number once in order, and as many signs and shifts")
+        return self
+
+
 class TrainingFile(StrictModel):
-    """Configuration of a training as a YAML file, whose ``schema`` a subclass names by a field ``schema_``."""
+    """Configuration of a training as a YAML file, whose ``schema`` a subclass names by a field ``schema_``.
+
+    Attributes:
+        data: Folder of a data set, or a file of paths; or several.
+        robot: File of the robot's kernel tables.
+        decay: Weight decay.
+        clip: Largest norm of the gradient.
+        ema: Decay of the exponential moving average of the weights.
+        precision: ``float32`` or ``bfloat16`` (mixed).
+        seed: Seed of all random choices.
+        weights: Relative frequency of paths in training, by patterns of ``suite/level``; the first that matches
+            counts, 1 where none does.
+        mirror: Mirror symmetry of the robot, by which the data are augmented.
+        held_out: Share of the problems kept for the validation loss.
+        log_every: Steps between two lines of the log.
+        save_every: Seconds between two saves.
+    """
+
+    data: str | Annotated[tuple[str, ...], Field(min_length=1)]
+    robot: str
+    decay: Annotated[float, Field(ge=0.0)] = 1e-2
+    clip: Positive = 1.0
+    ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.999
+    precision: Literal["float32", "bfloat16"] = "float32"
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    weights: dict[str, Annotated[float, Field(ge=0.0)]] = {}
+    mirror: MirrorConfig | None = None
+    held_out: Share = 0.02
+    log_every: Count = 100
+    save_every: Positive = 120.0
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Data sets as a tuple."""
+        return (self.data,) if isinstance(self.data, str) else self.data
 
     @classmethod
     def read(cls, path: str | os.PathLike[str], changes: Mapping[str, Any] | None = None) -> Self:
@@ -40,21 +89,6 @@ class TrainingFile(StrictModel):
         if data.get("schema") != schema:
             raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {schema!r}")
         return validate(cls, replaced(data, changes or {}, str(path)), str(path))
-
-
-class MirrorConfig(StrictModel):
-    """Mirror symmetry of a robot, see ``apex_ompl.training.data.Mirror``; one number for each joint."""
-
-    order: tuple[Annotated[int, Field(ge=0)], ...]
-    sign: tuple[Literal[-1, 1], ...]
-    shift: tuple[float, ...]
-
-    @model_validator(mode="after")
-    def _fits(self) -> MirrorConfig:
-        count = len(self.order)
-        if not len(self.sign) == len(self.shift) == count or sorted(self.order) != list(range(count)):
-            raise ValueError("expected every joint's number once in order, and as many signs and shifts")
-        return self
 
 
 class AutoencoderTraining(StrictModel):
@@ -74,10 +108,10 @@ class AutoencoderTraining(StrictModel):
 class TrainingConfig(TrainingFile):
     """Configuration of ``scripts/train.py``; attributes are keys of the file, except ``validation_sampling``.
 
+    Those of every training are described in :class:`TrainingFile`.
+
     Attributes:
         schema_: Version of the format.
-        data: Folder of a data set, or a file of paths; or several.
-        robot: File of the robot's kernel tables.
         cases: Folder of validation problems, as ``generate_data.py --write-cases`` writes them; none by default.
         initial: Checkpoint whose weights the training starts with, by name or folder; its latent space and key states
             are kept. Random weights by default.
@@ -90,23 +124,12 @@ class TrainingConfig(TrainingFile):
         batch: Paths in a step, over all processes.
         rate: Largest learning rate; it rises linearly over ``warmup`` steps and falls to 0 by half a cosine.
         warmup: Number of steps of the rise.
-        decay: Weight decay.
-        clip: Largest norm of the gradient.
-        ema: Decay of the exponential moving average of the weights.
-        precision: ``float32`` or ``bfloat16`` (mixed).
-        seed: Seed of all random choices.
-        weights: Relative frequency of paths in training, by patterns of ``suite/level``; the first that matches
-            counts, 1 where none does.
-        mirror: Mirror symmetry of the robot, by which the data are augmented.
         parts: Share of the paths of which a part is taken, for a scene ``clearances``, as ``mixed`` is, see
             :class:`apex_ompl.training.conditions.Augmentation`.
         mixed: Share of the paths among whose obstacles are put some of another scene that leave it free.
         collision: Weight of the collision cost of the denoiser's estimates in the loss, for a scene ``clearances``, see
             :meth:`~apex_ompl.training.scene_encoding.TorchSceneEncoding.collision_cost`; not in validation losses.
-        held_out: Share of the problems kept for the validation loss.
         units: Number of units of a data set in memory at the same time; all by default.
-        log_every: Steps between two lines of the log.
-        save_every: Seconds between two saves.
         validate_every: Steps between two validations by proposals.
         proposals: Number of proposals for each problem of a validation.
         validation_sampling: Sampling of a validation; its key in the file is ``judged``.
@@ -114,8 +137,6 @@ class TrainingConfig(TrainingFile):
     """
 
     schema_: Literal["apex-ompl/training/1"] = Field(alias="schema")
-    data: str | Annotated[tuple[str, ...], Field(min_length=1)]
-    robot: str
     cases: str | None = None
     initial: str | None = None
     latent: LatentConfig = LatentConfig()
@@ -127,20 +148,10 @@ class TrainingConfig(TrainingFile):
     batch: Count = 512
     rate: Positive = 5e-4
     warmup: Count = 500
-    decay: Annotated[float, Field(ge=0.0)] = 1e-2
-    clip: Positive = 1.0
-    ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.999
-    precision: Literal["float32", "bfloat16"] = "float32"
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    weights: dict[str, Annotated[float, Field(ge=0.0)]] = {}
-    mirror: MirrorConfig | None = None
     parts: Share = 0.0
     mixed: Share = 0.0
     collision: Annotated[float, Field(ge=0.0)] = 0.0
-    held_out: Share = 0.02
     units: Count = 1_000_000
-    log_every: Count = 100
-    save_every: Positive = 120.0
     validate_every: Count = 2000
     proposals: Count = 8
     validation_sampling: SamplingConfig = Field(SamplingConfig(), alias="judged")
@@ -160,11 +171,6 @@ class TrainingConfig(TrainingFile):
         if self.initial is not None and self.latent.kind != "linear":
             raise ValueError("expected a linear latent space with initial: a variational one is trained anew")
         return self
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Data sets as a tuple."""
-        return (self.data,) if isinstance(self.data, str) else self.data
 
     @property
     def determining(self) -> str:

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import os
-import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, distributed, nn
 
-from apex_ompl.errors import ApexError, FileFormatError, ParameterError
+from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import RobotTables
 from apex_ompl.model.config import ModelConfig, SplineConfig, key_shapes
 from apex_ompl.model.proposals import Sampling
@@ -25,17 +24,14 @@ from apex_ompl.training.autoencoder import LinearLatent, VariationalLatent
 from apex_ompl.training.conditions import Conditions
 from apex_ompl.training.config import TrainingConfig
 from apex_ompl.training.data import TrainingData
-from apex_ompl.training.kernel_problems import KernelProblem
+from apex_ompl.training.kernel_problems import KernelProblem, success_rates
 from apex_ompl.training.latent_diffusion import CollisionCost, Draws, FeaturesAlong, LatentDiffusion
-from apex_ompl.training.run_files import EXPECTED, STATE, RunLog, read_state, write_state
+from apex_ompl.training.run import RunLog, TrainingRun
 from apex_ompl.training.torch_model import TorchModel, load_torch_model, save_model
-from apex_ompl.training.validation import success_rates
-from apex_ompl.util.files import check_writable, is_file
 
 NETWORKS = ("latent", "condition", "denoiser", "noise")  # parts of a model that a configuration sets
 VALIDATION_PATHS = 2048  # most held-out paths on which the validation loss is taken
 PHASES = ("autoencoder", "denoiser")
-MAX_SKIPPED = 20  # steps in a row whose gradient is not finite
 
 
 @dataclass(frozen=True)
@@ -177,11 +173,7 @@ def _of_checkpoint(name: str, wanted: ModelConfig) -> LatentDiffusion:
     return network.train().requires_grad_(True)
 
 
-class TrainingError(ApexError):
-    """A training run cannot continue."""
-
-
-class Trainer:
+class Trainer(TrainingRun[LatentDiffusion]):
     """Training run of a model, resumed from the state in its folder where there is one.
 
     Each step samples its paths, noise and diffusion steps with a seed of its own. A resumed run therefore ends with the
@@ -194,10 +186,7 @@ class Trainer:
         problems: Validation problems.
         data: Training data.
         network: Model in training.
-        averaged: Exponential moving average of its weights, by name.
         phase: ``autoencoder`` or ``denoiser``.
-        step: Number of steps done in the phase.
-        seconds: Time of all steps [s].
     """
 
     def __init__(
@@ -216,17 +205,17 @@ class Trainer:
         Raises:
             ApexError: Data, tables or state cannot be read or do not fit.
         """
-        self.config, self.folder, self.process, self.problems, self._report = config, folder, process, problems, report
-        check_writable(folder / STATE)
+        super().__init__(config, folder, process.device)
+        self.config, self.process, self.problems, self._report = config, process, problems, report
         robot = RobotTables.load(config.robot)
         self.data = TrainingData(config, robot, process.device)
         self.network = initial_network(config, self.data, robot).to(process.device)
         self.phase = self._first_phase
-        self.step, self.seconds, self._skipped = 0, 0.0, 0
         self._digest = hashlib.sha256(f"{config.determining}{robot.name}{self.data.digest()}".encode()).hexdigest()
         self._start_phase()
-        if is_file(folder / STATE):
-            self._load_state()
+        state = self._load_state()
+        if state is not None:
+            self.data.go_to(state["number"], state["left"])
         self._runlog = RunLog(folder, self.progress) if process.rank == 0 else None
         collision_cost = self._collision_cost if config.collision else None
         objective = Objective(self.network, config.autoencoder.divergence, self.data.features_along, collision_cost)
@@ -242,72 +231,23 @@ class Trainer:
     @property
     def done(self) -> bool:
         """Whether the training is complete."""
-        return self.phase == "denoiser" and self.step >= self.steps
+        return self.phase == "denoiser" and super().done
 
     def advance(self) -> float:
-        """Do one step of AdamW, and return its loss; a step whose gradient is not finite changes no weight.
-
-        The average w' of the weights w follows as w' <- d w' + (1 - d) w with d = min(ema, (1 + step) / (10 + step)).
-
-        Raises:
-            TrainingError: The gradients of many steps in a row were not finite.
-        """
-        started = time.perf_counter()
+        """Do one step as :meth:`TrainingRun.advance`; the first of the denoiser follows the last of the autoencoder."""
         if self.step >= self.steps:
             self._end_autoencoder()
         self.data.count_step()
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._rate()
-        loss = self._loss()
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(self._parameters, self.config.clip)
-        self.step += 1
-        if torch.isfinite(norm):  # the same in all processes, as gradients are shared
-            self._skipped = 0
-            self._optimizer.step()
-            with torch.no_grad():
-                share = 1.0 - min(self.config.ema, (1.0 + self.step) / (10.0 + self.step))
-                torch._foreach_lerp_([self.averaged[name] for name in self._names], list(self._parameters), share)
-        else:
-            self._skipped += 1
-            if self._skipped >= MAX_SKIPPED:
-                raise TrainingError(f"{self.phase}, step {self.step}: {MAX_SKIPPED} gradients in a row are not finite")
-        self.seconds += time.perf_counter() - started
-        return float(loss.detach())
+        return super().advance()
 
-    def run(self, seconds: float = math.inf, watch: Callable[[Trainer, float], None] | None = None) -> None:
-        """Train to the end, or for some seconds; log, save and validate at the configured intervals.
-
-        Args:
-            seconds: Time limit [s].
-            watch: Called after each step with this trainer and the loss.
-        """
-        started = saved = time.perf_counter()
-        losses: list[float] = []
-        while not self.done and not self.process.any(time.perf_counter() - started >= seconds):
-            losses.append(self.advance())
-            if watch is not None:
-                watch(self, losses[-1])
-            last = self.step == self.steps
-            if self.step % self.config.log_every == 0 or last:
-                self._log(float(np.mean(losses)), last)
-                losses = []
-            if time.perf_counter() - saved > self.config.save_every:
-                self.save()
-                saved = time.perf_counter()
-        self.save()
+    def _any(self, flag: bool) -> bool:
+        return self.process.any(flag)
 
     def save(self) -> None:
         """Write the state of the run, and the averaged model as a checkpoint."""
         if self.process.rank != 0:
             return
-        state = {
-            "phase": self.phase, "step": self.step, "number": self.data.number, "left": self.data.left,
-            "seconds": self.seconds, "network": self.network.state_dict(), "averaged": self.averaged,
-            "optimizer": self._optimizer.state_dict(),
-        }  # fmt: skip
-        write_state(self.folder, self._digest, state)
+        self._write_state(self.data.number, self.data.left)
         save_model(self.folder / "checkpoint", self.averaged_network(), self.about())
 
     def averaged_network(self) -> LatentDiffusion:
@@ -335,15 +275,7 @@ class Trainer:
         modules = [network.autoencoder] if self.phase == "autoencoder" else [network.encoder, network.denoiser]
         chosen = {id(p) for module in modules for p in module.parameters()}
         named = [(name, p) for name, p in self.network.named_parameters() if id(p) in chosen]
-        self._names, self._parameters = [name for name, _ in named], [p for _, p in named]
-        self.averaged = {name: p.detach().clone() for name, p in self.network.named_parameters()}
-        self._optimizer = torch.optim.AdamW(
-            [
-                {"params": [p for p in self._parameters if p.ndim > 1], "weight_decay": self.config.decay},
-                {"params": [p for p in self._parameters if p.ndim <= 1], "weight_decay": 0.0},
-            ],
-            lr=self._rate(), betas=(0.9, 0.99), fused=self.process.device.type == "cuda",
-        )  # fmt: skip
+        self._optimize(named)
 
     def _end_autoencoder(self) -> None:
         """Take over the averaged autoencoder, fit the scale of its latent space, and start with the denoiser."""
@@ -390,8 +322,7 @@ class Trainer:
         """Append a row to the log, with the validation loss, and where it is time the success rates."""
         if self._runlog is None:
             return
-        row: dict[str, Any] = {"phase": self.phase, "step": self.step, "loss": f"{loss:.6f}"}
-        row |= {"rate": f"{self._rate():.3g}", "seconds": f"{self.seconds:.1f}"}
+        row = self._row(loss)
         network = self.averaged_network().to(self.process.device)
         validation = self.data.validation
         if validation is not None:
@@ -421,19 +352,8 @@ class Trainer:
     def _first_phase(self) -> str:
         return "autoencoder" if isinstance(self.network.autoencoder, VariationalLatent) else "denoiser"
 
-    def _load_state(self) -> None:
-        state = read_state(self.folder, self._digest, self.process.device)
-        try:
-            self.network.load_state_dict(state["network"])
-            if state["phase"] != self.phase:
-                self.network.autoencoder.requires_grad_(False)
-                self.phase = state["phase"]
-                self._start_phase()
-            self.step, self.seconds = state["step"], state["seconds"]
-            averaged = {name: state["averaged"][name].to(self.process.device) for name in self.averaged}
-            self._optimizer.load_state_dict(state["optimizer"])
-            number, left = state["number"], state["left"]
-        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            raise FileFormatError(str(self.folder / STATE), "", type(error).__name__, EXPECTED) from error
-        self.averaged = averaged
-        self.data.go_to(number, left)
+    def _go_to(self, phase: str) -> None:
+        if phase != self.phase:
+            self.network.autoencoder.requires_grad_(False)
+            self.phase = phase
+            self._start_phase()

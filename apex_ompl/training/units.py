@@ -23,8 +23,7 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.problems import scenes
 from apex_ompl.problems.broad import GRAMMARS
 from apex_ompl.problems.broad_representation import part_of
-from apex_ompl.problems.catalogue import KNOWN, LEVELS, SPLITS, TRAINING, VALIDATION
-from apex_ompl.problems.generator import SuiteError
+from apex_ompl.problems.catalogue import KNOWN, LEVELS, SPLITS, TRAINING, VALIDATION, SuiteError
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Problem
@@ -225,7 +224,7 @@ def _model(name: str, spline: Spline) -> TrajectoryModel:
 
 def _proposer(model: TrajectoryModel, finder: MeshPathFinder) -> Callable[[int, int], Array]:
     """Return a function from a count and a seed to a model's proposals for a problem."""
-    from apex_ompl.apex.query import make_query
+    from apex_ompl.apex.models import make_query
 
     def propose(count: int, seed: int) -> Array:
         query = make_query(finder.setup.checker, finder.start, finder.goal, point=model.sees_point)

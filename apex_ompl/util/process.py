@@ -16,12 +16,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import pairwise
 
 from apex_ompl.util.forking import ProcessLock
 
 PATIENCE = 20.0  # how long the interpreter waits for running work; the set-up of a planner ends by itself [s]
 LOOK = 0.01  # between two looks [s]
+PART = 256  # rows of arrays, fewer than which are not worth a thread of their own
 
 _code: int | None = None  # of the process, where it is to end quickly
 
@@ -155,3 +158,22 @@ def one_torch_thread() -> Iterator[None]:
             count = _before.pop()
             if not _before:
                 torch.set_num_threads(count)
+
+
+def in_threads(count: int, threads: int, call: Callable[[slice], None]) -> None:
+    """Call with slices that together are all of some rows, several at once in threads.
+
+    Compiled code needs no lock of the interpreter.
+
+    Raises:
+        ParameterError: The number of threads is no positive whole number.
+    """
+    from apex_ompl.util.validation import check_integer  # which imports NumPy
+
+    parts = min(check_integer(threads, "threads", 1), max(count // PART, 1))
+    if parts == 1:
+        call(slice(count))
+        return
+    edges = [count * k // parts for k in range(parts + 1)]
+    with ThreadPoolExecutor(parts) as pool:
+        list(pool.map(call, (slice(first, end) for first, end in pairwise(edges))))

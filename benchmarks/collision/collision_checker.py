@@ -10,7 +10,6 @@ Usage: python -m benchmarks.collision.collision_checker [--states 50000] [--path
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 
@@ -197,7 +196,7 @@ def check_paths(checkers: tuple[CollisionChecker, CollisionChecker], paths: list
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--states", type=one_or_more, default=50_000, help="states checked, over all scenes")
     parser.add_argument("--paths", type=one_or_more, default=200, help="straight paths a scene")
     parser.add_argument("--seed", type=whole_number, default=0)

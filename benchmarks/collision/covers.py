@@ -9,7 +9,6 @@ Usage: python -m benchmarks.collision.covers FILE.json...
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -72,7 +71,7 @@ def measure(path: Path, states: int, seeds: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--states", type=one_or_more, default=3000)
     parser.add_argument("--seeds", type=one_or_more, default=10)

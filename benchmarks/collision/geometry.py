@@ -17,7 +17,6 @@ Usage: python -m benchmarks.collision.geometry [-n 60] [--states 2000]
 
 from __future__ import annotations
 
-import argparse
 import resource
 import tempfile
 import time
@@ -30,7 +29,7 @@ import trimesh
 from tqdm import tqdm
 
 from apex_ompl import MotionPlanner, PlanResult, load_model, load_problem, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.model.proposals import TrajectoryModel
 from apex_ompl.ompl.process import quiet_ompl
@@ -251,8 +250,7 @@ def updates() -> tuple[list[str], dict[str, Any]]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=60, help="problems and scenes (default: %(default)s)")
+    parser = record.parser(__doc__, n=60, of="problems and scenes")
     parser.add_argument("--states", type=one_or_more, default=2000, help="states of a problem (default: %(default)s)")
     args = parser.parse_args()
     rows, figures = sizes()

@@ -10,7 +10,6 @@ Usage: python -m benchmarks.collision.geometry_states [--states 1000000] [--jobs
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -60,9 +59,8 @@ def count_states(kind: str, number: int) -> tuple[int, int, int, int, int]:
 
 def main() -> None:
     """Count, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, jobs=2)
     parser.add_argument("--states", type=one_or_more, default=1_000_000, help="of each kind (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
     args = parser.parse_args()
     scenes = -(-args.states // EACH)
     head = (

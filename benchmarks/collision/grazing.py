@@ -77,20 +77,45 @@ class PairDistances:
         self.scene = checker.meshes
         self.robot = checker.robot
         self.data = self.robot.model.createData()
+        for solid in self.scene.solids.values():
+            solid.shape.computeLocalAABB()
 
     def __call__(self, q: np.ndarray, pairs: list[tuple[int, int]]) -> np.ndarray:
         """Return the distances of pairs of geometries at a state, shape (pairs,) [m]."""
-        found = []
+        self._place(q)
+        return np.array([self._distance(*pair) for pair in pairs])
+
+    def nearest(self, q: np.ndarray) -> tuple[float, tuple[int, int]]:
+        """Return the least distance of all pairs at a state [m], and its pair.
+
+        Pairs are taken by the gaps of the balls that Coal puts around them, which are at most the distances.
+        """
+        self._place(q)
+        balls = {}
+        for k, solid in self.scene.solids.items():
+            balls[k] = self._pose(k).act(solid.shape.aabb_center), solid.shape.aabb_radius
+        pairs, least, nearest = self.scene.pairs, np.inf, (-1, -1)
+        gaps = np.array([np.linalg.norm(balls[a][0] - balls[b][0]) - balls[a][1] - balls[b][1] for a, b in pairs])
+        gaps[np.isnan(gaps)] = -np.inf  # of half-spaces, whose balls are infinite
+        for k in np.argsort(gaps):
+            if gaps[k] > least:
+                break
+            value = self._distance(*pairs[k])
+            least, nearest = (value, pairs[k]) if value < least else (least, nearest)
+        return least, nearest
+
+    def _place(self, q: np.ndarray) -> None:
         pin.forwardKinematics(self.robot.model, self.data, self.robot.to_pinocchio(q))
-        for a, b in pairs:
-            request, result = coal.DistanceRequest(), coal.DistanceResult()
-            request.gjk_tolerance, request.gjk_max_iterations = EXACT, 1000
-            sides = []
-            for k in (a, b):
-                solid = self.scene.solids[k]
-                sides += [solid.shape, transform(self.data.oMi[solid.joint] * solid.placement)]
-            found.append(coal.distance(*sides, request, result))
-        return np.array(found)
+
+    def _pose(self, number: int) -> pin.SE3:
+        solid = self.scene.solids[number]
+        return self.data.oMi[solid.joint] * solid.placement
+
+    def _distance(self, a: int, b: int) -> float:
+        request, result = coal.DistanceRequest(), coal.DistanceResult()
+        request.gjk_tolerance, request.gjk_max_iterations = EXACT, 1000
+        sides = (part for k in (a, b) for part in (self.scene.solids[k].shape, transform(self._pose(k))))
+        return float(coal.distance(*sides, request, result))
 
     def least_along(self, a: np.ndarray, b: np.ndarray, pair: tuple[int, int]) -> float:
         """Return the least distance of a pair on a straight path: 200 states, then golden section [m]."""
@@ -203,14 +228,13 @@ def lay_graze(
     meshes: CollisionChecker, distances: PairDistances, rng: np.random.Generator, a: np.ndarray, b: np.ndarray
 ) -> Graze | None:
     """Return a path through the border of contact between a free state ``a`` and a colliding one ``b``, shifted."""
-    low, high, scene, robot = 0.0, 1.0, distances.scene, meshes.robot
+    low, high, robot = 0.0, 1.0, meshes.robot
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if meshes.is_free(a + middle * (b - a)) else (low, middle)
     state = a + low * (b - a)
-    values = distances(state, scene.pairs)
-    pair = scene.pairs[int(np.argmin(values))]
-    if values.min() > 1e-5:  # a solid inside of another
+    least, pair = distances.nearest(state)
+    if least > 1e-5:  # a solid inside of another
         return None
     step = 1e-6 * np.eye(robot.dof)
     outer = a + (low - 1e-3) * (b - a)  # a little clear of the contact, where distances are smooth

@@ -9,7 +9,6 @@ Usage: python -m benchmarks.collision.kernel_back_ends [--states 1000000] [--pla
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -130,7 +129,7 @@ print(json.dumps(found))
 
 def main() -> None:
     """Compare, time, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--states", type=one_or_more, default=1_000_000, help="(default: %(default)s)")
     parser.add_argument("--plans", type=one_or_more, default=60, help="(default: %(default)s)")
     parser.add_argument("--rounds", type=one_or_more, default=40, help="(default: %(default)s)")

@@ -14,7 +14,6 @@ Usage: python -m benchmarks.collision.proofs [--states 1000000] [--motions 2000]
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -172,11 +171,10 @@ def grazes(name: str, wanted: int, seed: int, jobs: int) -> Grazes:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, jobs=1)
     parser.add_argument("--states", type=one_or_more, default=1_000_000)
     parser.add_argument("--motions", type=one_or_more, default=2000)
     parser.add_argument("--grazes", type=one_or_more, default=2000)
-    parser.add_argument("--jobs", type=one_or_more, default=1)
     parser.add_argument("--robot", action="append", default=[])
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()

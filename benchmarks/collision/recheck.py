@@ -12,7 +12,6 @@ Usage: python -m benchmarks.collision.recheck [--runs head_to_head] [--spacing 0
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
 import math
@@ -36,7 +35,7 @@ from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder
-from apex_ompl.util.validation import one_or_more, positive_number
+from apex_ompl.util.validation import positive_number
 from benchmarks.lib import record
 
 DEPENDS = ("@benchmark", "apex_ompl/timing", "benchmarks/planners/head_to_head.py", "benchmarks/planners/standing.py")
@@ -148,13 +147,12 @@ def table_of(rows: list[dict[str, Any]]) -> tuple[list[str], list[list[Any]]]:
 
 def main() -> None:
     """Check what is left, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, jobs=2)
     parser.add_argument("--runs", default="head_to_head", help="folder in benchmarks/runs (default: %(default)s)")
     parser.add_argument("--spacing", type=positive_number, default=SPACING, metavar="RAD", help="on paths")
     parser.add_argument(
         "--motion-spacing", type=positive_number, default=MOTION_SPACING, metavar="RAD", help="on motions"
     )
-    parser.add_argument("--jobs", type=one_or_more, default=2)
     args = parser.parse_args()
     spacings = (args.spacing, args.motion_spacing)
     results = Results.load(RUNS / args.runs)

@@ -10,7 +10,6 @@ FOLDER is another checkout, ``git worktree add FOLDER COMMIT`` makes one.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
@@ -60,7 +59,7 @@ np.savez(out, free=np.concatenate(free), proved=proved, moves=moves)
 
 def main() -> None:
     """Compare, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     add_checkout(parser)
     parser.add_argument("--states", type=one_or_more, default=1_000_000, help="(default: %(default)s)")
     args = parser.parse_args()

@@ -11,7 +11,6 @@ Usage: python -m benchmarks.collision.world_edits [-n 10000] [--every 100]
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 import threading
@@ -130,7 +129,7 @@ def ball(around: int, along: int) -> str:
 
 def main() -> None:
     """Edit, compare and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("-n", type=one_or_more, default=10_000, metavar="EDITS")
     parser.add_argument("--every", type=one_or_more, default=100, metavar="EDITS", help="between comparisons")
     args = parser.parse_args()

@@ -29,8 +29,7 @@ from apex_ompl.ompl.parameters import register
 from apex_ompl.training.data import Mirror, shard_paths
 from apex_ompl.training.records import Paths, held_extents
 from apex_ompl.training.torch_model import load_torch_model
-from benchmarks.lib.controls import Shuffled, drawn
-from benchmarks.lib.neighbors import Neighbors
+from benchmarks.lib.controls import Neighbors, Shuffled, drawn
 
 DATA = Path(__file__).resolve().parents[2] / "data" / "dual_panda_softhand"
 NEAR = 4  # times as many nearest paths as are wanted are there to draw from

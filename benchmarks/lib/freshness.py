@@ -10,7 +10,6 @@ Usage: python -m benchmarks.lib.freshness [--quoted README.md]
 
 from __future__ import annotations
 
-import argparse
 import ast
 import json
 import re
@@ -135,7 +134,7 @@ def quoted(text: str) -> set[str]:
 
 def main() -> None:
     """Print the freshness of all results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--quoted", type=Path, metavar="FILE", help="fail where a result that it links to is not fresh")
     args = parser.parse_args()
     found = [freshness(record.ROOT, result) for result in sorted(record.RESULTS.glob("*.json"))]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import json
 import math
 import platform
 import sys
-from collections.abc import Iterable
+import time
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ import numpy as np
 from apex_ompl import problems
 from apex_ompl.util import provenance
 from apex_ompl.util.files import write_atomically
+from apex_ompl.util.validation import one_or_more
 
 try:
     from apex_ompl.evaluation import Results
@@ -75,6 +78,35 @@ def _called(file: Path) -> str:
 def _shown(argument: str) -> str:
     """Return an argument as results name it: of a place on this machine the name alone."""
     return Path(argument).name if Path(argument).is_absolute() else argument
+
+
+def parser(
+    doc: str, n: int | None = None, of: str = "problems of a level", jobs: int | None = None
+) -> argparse.ArgumentParser:
+    """Return the parser of a benchmark, with ``-n`` and ``--jobs`` where their defaults are given.
+
+    Args:
+        doc: The module's docstring, whose first line is the description.
+        n: Default of ``-n``.
+        of: What is counted by ``-n``.
+        jobs: Default of ``--jobs``: 1 where runs are timed.
+    """
+    found = argparse.ArgumentParser(description=doc.splitlines()[0])
+    if n is not None:
+        found.add_argument("-n", type=one_or_more, default=n, help=f"{of} (default: %(default)s)")
+    if jobs is not None:
+        found.add_argument("--jobs", type=one_or_more, default=jobs, help="runs at a time (default: %(default)s)")
+    return found
+
+
+def fastest(call: Callable[[], Any], repeats: int = 5) -> float:
+    """Return the least time of a call among several [s]."""
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - started)
+    return min(times)
 
 
 def session() -> dict[str, str]:

@@ -19,7 +19,7 @@ import trimesh
 from apex_ompl import problems
 from apex_ompl.loop.sensor import Sensor
 from apex_ompl.problems.world_robot import RobotPlaces
-from apex_ompl.problems.world_scripts import ScriptedEnvironment
+from apex_ompl.problems.worlds import ScriptedEnvironment
 from apex_ompl.scene.bodies import Obstacle, PlaceInTime
 from apex_ompl.scene.scripts import row_of
 from apex_ompl.types import Array

@@ -152,9 +152,7 @@ def stored(jobs: Sequence[Job], args: argparse.Namespace, make: Callable[[Job], 
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=60, help="worlds of each kind (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: %(default)s)")
+    parser = record.parser(__doc__, n=60, of="worlds of each kind", jobs=1)
     parser.add_argument("--split", default="test", choices=("test", "validation"))
     parser.add_argument("--kinds", nargs="+", default=list(worlds.kinds()), choices=worlds.kinds())
     parser.add_argument("--methods", nargs="+", default=names(), choices=names())

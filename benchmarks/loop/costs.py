@@ -14,11 +14,10 @@ Usage: python -m benchmarks.loop.costs [-n 30] [--runs 30] [--write] [--add "pro
 
 from __future__ import annotations
 
-import argparse
 import json
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -58,26 +57,16 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
+from benchmarks.lib.record import fastest
 from benchmarks.loop.replan_times import replan_times
 
 DEPENDS = ("@planning", "apex_ompl/moving", "apex_ompl/loop", "apex_ompl/baselines", "apex_ompl/timing")
-REPEATS = 5
 PLANNERS = (
     "apex", "no-network", "retime", "apex-sprint", "rrtconnect", "potential-field", "mppi", "gpmp2", "drrt", "damon",
     "il", "apex-paper", "apex-paper-unguided",
 )  # fmt: skip
 LEAST_FACTOR = 0.5
 LEAST_SHARE = 0.1  # of what replans took that work of new kinds must be charged for, to be scaled
-
-
-def seconds(call: Callable[[], Any]) -> float:
-    """Return the least time of a call among several [s]."""
-    times = []
-    for _ in range(REPEATS):
-        begin = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - begin)
-    return min(times)
 
 
 def interval_of_proof(context: RunContext) -> float:
@@ -91,7 +80,7 @@ def interval_of_proof(context: RunContext) -> float:
         ).trajectory
         proof = checker.prove(curve_of(motion), tolerance=0.0)
         if proof and proof.by_spheres == 1.0:
-            return seconds(lambda m=motion: checker.prove(curve_of(m), tolerance=0.0)) / proof.intervals
+            return fastest(lambda m=motion: checker.prove(curve_of(m), tolerance=0.0)) / proof.intervals
     raise SystemExit("no motion is proved by spheres alone, expected one of 100")
 
 
@@ -112,50 +101,50 @@ def measured(name: str, found: dict[str, list[float]]) -> None:
     kernel, limits, goal = context.kernel, context.limits, context.goals[0]
     dynamic = DynamicObstacles(world.present(0.0))
     ends = np.stack([setup.start, goal])
-    found["straight motion"].append(seconds(lambda: time_path(ends, limits, context.names)))
+    found["straight motion"].append(fastest(lambda: time_path(ends, limits, context.names)))
     motion = time_path(ends, limits, context.names).trajectory
     still = np.zeros_like(ends)
-    found["direct motion"].append(seconds(lambda: between(np.stack([ends, still, still]), limits, context.names)))
+    found["direct motion"].append(fastest(lambda: between(np.stack([ends, still, still]), limits, context.names)))
     pieces = motion.states(np.array([0.0, 0.5 * motion.duration, motion.duration]))
-    piece = seconds(lambda: through(pieces, limits, context.names, 0.0))  # the first one is too long
+    piece = fastest(lambda: through(pieces, limits, context.names, 0.0))  # the first one is too long
     found["piece of a motion"].append(piece)
-    found["joined motion"].append(seconds(lambda: through(pieces, limits, context.names)) - 2.0 * piece)
+    found["joined motion"].append(fastest(lambda: through(pieces, limits, context.names)) - 2.0 * piece)
     one, half = Following(motion, 0.0), 0.5 * motion.duration
     then = half + context.settings.period
-    found["proved stop"].append(seconds(lambda: context.proved_stop(reachable(dynamic, half), one, half, then)))
+    found["proved stop"].append(fastest(lambda: context.proved_stop(reachable(dynamic, half), one, half, then)))
     moments = np.arange(0.0, motion.duration, GUARDED)
     looked, _ = context.foreseen_stops(dynamic, one, moments, AGE, SPREAD)
     if looked > 0:
-        taken = seconds(lambda: context.foreseen_stops(dynamic, one, moments, AGE, SPREAD))
+        taken = fastest(lambda: context.foreseen_stops(dynamic, one, moments, AGE, SPREAD))
         found["foreseen stop"].append(taken / min(looked + 1, len(moments)))
-    found["stop joint by joint"].append(seconds(lambda: context.clear_stop(one, half, along=False)))
+    found["stop joint by joint"].append(fastest(lambda: context.clear_stop(one, half, along=False)))
     curve = curve_of(motion)
     rate = interval_of_proof(context)
     found["proof interval"].append(rate)
     proof = context.checker.prove(curve, tolerance=0.0)
-    taken = seconds(lambda: context.checker.prove(curve, tolerance=0.0))
+    taken = fastest(lambda: context.checker.prove(curve, tolerance=0.0))
     if proof.by_spheres < 1.0:
         found["exact proof"].append(max(taken - rate * proof.intervals, 0.0))
     intervals = prove_motion(kernel, dynamic, motion).intervals
     found["interval among dynamic obstacles"].append(
-        seconds(lambda: prove_motion(kernel, dynamic, motion)) / max(intervals, 1)
+        fastest(lambda: prove_motion(kernel, dynamic, motion)) / max(intervals, 1)
     )
     line = np.linspace(setup.start, goal, 64)
     spline = TimedSpline.along(line, motion.duration, Start.at_rest(setup.start), goal)
     optimizer = MotionOptimizer(kernel, dynamic, limits, MOTIONS)
     optimizer.improve(spline, steps=4)
     count = optimizer.samples
-    found["sample of a motion"].append(seconds(lambda: optimizer.improve(spline, steps=4)) / count)
-    found["retiming"].append(seconds(lambda: retime(kernel, dynamic, motion, limits)))
+    found["sample of a motion"].append(fastest(lambda: optimizer.improve(spline, steps=4)) / count)
+    found["retiming"].append(fastest(lambda: retime(kernel, dynamic, motion, limits)))
     times = np.linspace(0.0, motion.duration, 64)
-    found["clearance in time"].append(seconds(lambda: clearance_in_time(kernel, dynamic, line, times, 0.3)) / 64)
+    found["clearance in time"].append(fastest(lambda: clearance_in_time(kernel, dynamic, line, times, 0.3)) / 64)
     bent = np.stack([setup.start, 0.5 * (setup.start + goal) + 0.05, goal])
     bent = np.clip(
         Optimizer().spline.path(Optimizer().spline.fit(bent, limits.lower, limits.upper).control),
         limits.lower,
         limits.upper,
     )
-    found["path in time"].append(seconds(lambda: time_path(bent, limits, context.names)))
+    found["path in time"].append(fastest(lambda: time_path(bent, limits, context.names)))
 
 
 def controls(name: str, found: dict[str, list[float]]) -> None:
@@ -170,8 +159,8 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     states = np.ascontiguousarray(points[3:]).reshape(-1, points.shape[2])
     times = np.repeat(0.05 * np.arange(control.steps), control.rollouts)
     some = np.ascontiguousarray(states[:: control.sparse])
-    moving = seconds(lambda: clearance_in_time(context.kernel, dynamic, states, times, control.clearance_margin))
-    own = seconds(lambda: context.kernel.clearance(some, control.own_margin))
+    moving = fastest(lambda: clearance_in_time(context.kernel, dynamic, states, times, control.clearance_margin))
+    own = fastest(lambda: context.kernel.clearance(some, control.own_margin))
     found["near clearance in time"].append(moving / len(states))
     found["near clearance"].append(own / len(some))
 
@@ -179,19 +168,19 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
         rolled = horizon.roll(search.start, control.tried(search, horizon))
         softmax(control.costs(search, horizon, rolled), control.temperature)
 
-    found["state of a rollout"].append(max(seconds(rollouts) - moving - own, 0.0) / len(states))
+    found["state of a rollout"].append(max(fastest(rollouts) - moving - own, 0.0) / len(states))
     one = np.zeros((control.steps, len(setup.start)))
     found["short motion"].append(
-        seconds(lambda: horizon.motion(search.start, horizon.roll(search.start, one[:, None])[:, 0], context.names))
+        fastest(lambda: horizon.motion(search.start, horizon.roll(search.start, one[:, None])[:, 0], context.names))
     )
     reflex = PotentialField()
-    found["force"].append(seconds(lambda: reflex.controls(search, horizon)) / reflex.steps)
+    found["force"].append(fastest(lambda: reflex.controls(search, horizon)) / reflex.steps)
     factors = IncrementalGPMP2()
     _, initial = next(factors.initial_motions(search))
     graph = factors.problem(search, initial.duration)
     started = factors.supports(search, initial, initial.duration)
     count = graph.maximum(started, factors.iterations, 0.0).evaluations * len(graph.times)
-    found[WORK].append(seconds(lambda: graph.maximum(started, factors.iterations, 0.0)) / count)
+    found[WORK].append(fastest(lambda: graph.maximum(started, factors.iterations, 0.0)) / count)
     step = DynamicRRTReplanner().search.step
     tree = GoalTree(context.goals, step, 200)
     while not tree.full:
@@ -202,9 +191,9 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     first, last = (ends[:1] for ends in tree.edges)
     Clearances(once).edges(first, last)
     looked, of_own = (once.budget.counts[kind] for kind in ("near clearance in time", "near clearance"))
-    before = seconds(lambda: Clearances(anew(search)).edges(first, last))
+    before = fastest(lambda: Clearances(anew(search)).edges(first, last))
     each = max(before - looked * moving / len(states) - of_own * own / len(some), 0.0)
-    found["extension of a tree"].append(each + seconds(lambda: tree.extend(tree.nearest(q), q, refused)))
+    found["extension of a tree"].append(each + fastest(lambda: tree.extend(tree.nearest(q), q, refused)))
 
 
 def graph(name: str, found: dict[str, list[float]]) -> None:
@@ -215,10 +204,10 @@ def graph(name: str, found: dict[str, list[float]]) -> None:
     damon = source.damon
     states, start = damon.states(setup.start), setup.start[None]
     usable = np.ones(len(states), bool)
-    found["query of a graph"].append(seconds(lambda: damon.search(states, usable, start, context.goals)))
+    found["query of a graph"].append(fastest(lambda: damon.search(states, usable, start, context.goals)))
     search, reached = LazySearch(replace(damon.graph, states=states), usable, start, context.goals), list[int]()
     search.connect(start=0, nodes=np.arange(100))  # and no goal: all that can be reached is
-    taken = seconds(lambda: search.run(refused, lambda: False, reached.append))
+    taken = fastest(lambda: search.run(refused, lambda: False, reached.append))
     found["node of a graph"].append(taken / max(reached[0], 1))
 
 
@@ -251,7 +240,7 @@ def trees() -> dict[str, float]:
         sprint.prepare(context)
         first = anew(search)
         list(sprint.initial_motions(first))
-        sprinted += seconds(lambda one=sprint, of=search: list(one.initial_motions(anew(of))))
+        sprinted += fastest(lambda one=sprint, of=search: list(one.initial_motions(anew(of))))
         states += first.budget.counts[SPRINT]
     return {"motion of a tree": spent / motions, SPRINT: sprinted / states}
 
@@ -263,7 +252,7 @@ def anew(search: Search) -> Search:
 
 def network() -> dict[str, float]:
     """Return the costs of a call of the network, of each proposal, and of each chunk of the imitation policy [s]."""
-    from apex_ompl.apex.query import make_query
+    from apex_ompl.apex.models import make_query
 
     setup = assemble(worlds.load("vertical/moving-large-0.2/800000").problem.still)
     context, source = RunContext(setup, setup.robot.limits, setup.robot.limits, LoopSettings()), Proposals()
@@ -273,17 +262,17 @@ def network() -> dict[str, float]:
     policy = ImitationReplanner()
     policy.prepare(context)
     begin, end = setup.start, context.goals[0]
-    chunk = seconds(lambda: policy.states(begin, end)) / (policy.steps / 8)
+    chunk = fastest(lambda: policy.states(begin, end)) / (policy.steps / 8)
     taken = {}
     with model.one_thread():
         for count in (1, 8):
-            taken[count] = seconds(lambda n=count: model.propose(query, checker.kernel, n))
+            taken[count] = fastest(lambda n=count: model.propose(query, checker.kernel, n))
     each = max((taken[8] - taken[1]) / 7.0, 0.0)
     paths = {}
     for guided, kind in ((False, "path of the paper"), (True, "guided path of the paper")):
         paper = OneProposal(guided)
         paper.prepare(context)
-        paths[kind] = seconds(lambda one=paper: one.propose(setup.start, context.goals[0], np.random.default_rng(0)))
+        paths[kind] = fastest(lambda one=paper: one.propose(setup.start, context.goals[0], np.random.default_rng(0)))
     return {"proposals": taken[1] - each, "proposal": each, **paths, "chunk of a policy": chunk}
 
 
@@ -335,8 +324,7 @@ def add(kind: str, names: Sequence[str], found: dict[str, list[float]]) -> None:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=30, help="worlds (default: %(default)s)")
+    parser = record.parser(__doc__, n=30, of="worlds")
     parser.add_argument("--runs", type=one_or_more, default=30, help="of each way (default: %(default)s)")
     parser.add_argument("--write", action="store_true", help="write the table of the package, too")
     parser.add_argument("--add", metavar="KIND", help="add new kinds to the table by what they take compared with this")

@@ -10,8 +10,6 @@ Usage: python -m benchmarks.loop.dynamic_obstacles [-n 10000] [--costs 300]
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -86,15 +84,10 @@ def soundness(checker: CollisionChecker, motions: list[Trajectory], count: int) 
     return found
 
 
-def timed(call: Callable[[], Any], repeats: int = 3) -> float:
+def timed(call: Callable[[], Any]) -> float:
     """Return the least time of a call [s], the first one apart."""
     call()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - begin)
-    return min(times)
+    return record.fastest(call, 3)
 
 
 def costs(checker: CollisionChecker, count: int) -> dict[str, list[float]]:
@@ -136,7 +129,7 @@ def costs(checker: CollisionChecker, count: int) -> dict[str, list[float]]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument(
         "-n", type=one_or_more, default=10_000, help="motions and dynamic obstacles (default: %(default)s)"
     )

@@ -15,7 +15,6 @@ Usage: python -m benchmarks.loop.guarded_runs [-n 8000] [--attacks 2000] [--cont
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from typing import Any
@@ -77,15 +76,13 @@ def row(kind: str, runs: list[dict[str, Any]]) -> list[Any]:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=8000, help="runs in the suites' worlds (%(default)s)")
+    parser = record.parser(__doc__, n=8000, of="runs in the suites' worlds", jobs=1)
     parser.add_argument(
         "--attacks", type=one_or_more, default=2000, help="runs in worlds that attack (default: %(default)s)"
     )
     parser.add_argument(
         "--controls", type=one_or_more, default=200, help="attacks on each control (default: %(default)s)"
     )
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: %(default)s)")
     parser.add_argument("--split", default="test", choices=("test", "validation"))
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()

@@ -7,7 +7,6 @@ Usage: python -m benchmarks.model.data_engine [--units 2] [--workers 2] [--first
 
 from __future__ import annotations
 
-import argparse
 import json
 import multiprocessing
 import resource
@@ -71,7 +70,7 @@ def scaled(workers: int) -> dict[str, float]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument(
         "--units",
         type=one_or_more,

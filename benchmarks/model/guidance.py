@@ -8,7 +8,6 @@ Usage: python -m benchmarks.model.guidance [-n 4] [--jobs 1]
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 from typing import Any
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 
 from apex_ompl import problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.evaluation import Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
@@ -29,7 +28,6 @@ from apex_ompl.paths.path import path_length
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 DEPENDS = ("@planning", "apex_ompl/model")
@@ -75,9 +73,7 @@ def proposals(job: Job) -> Run:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=4, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one)")
+    parser = record.parser(__doc__, n=4, jobs=1)
     args = parser.parse_args()
     results = bench(
         LEVELS, ROWS, FOLDER, runs=args.n, timeout=600.0, split="validation", workers=Workers(args.jobs),

@@ -7,7 +7,6 @@ Usage: python -m benchmarks.model.model_latency [--repeat 30]
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import time
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import load_model, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.model.checkpoint import shipped
 from apex_ompl.model.guidance import Guidance
 from apex_ompl.model.proposals import Sampling
@@ -26,7 +25,7 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
-DEPENDS = ("apex_ompl/model", "apex_ompl/apex/query.py", "apex_ompl/kernel", "apex_ompl/ompl", "problems")
+DEPENDS = ("apex_ompl/model", "apex_ompl/apex/models.py", "apex_ompl/kernel", "apex_ompl/ompl", "problems")
 PROBLEM = "shelf/hard/800003"
 COUNTS = (1, 4, 8, 32)
 STEPS = (1, 2, 8)
@@ -66,7 +65,7 @@ def load_seconds(name: str, repeat: int = 5) -> float:
 
 def main() -> None:
     """Measure all that ship, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--repeat", type=one_or_more, default=30)
     args = parser.parse_args()
     lines = [["model", "B", "steps", "guided", "condition ms", "network ms", "guidance ms", "decode ms", "total ms"]]

@@ -19,10 +19,9 @@ from typing import Any
 
 import torch
 
-from apex_ompl.training.kernel_problems import load_kernel_problems
-from apex_ompl.training.run_files import read_log
+from apex_ompl.training.kernel_problems import load_kernel_problems, success_rates
+from apex_ompl.training.run import read_log
 from apex_ompl.training.torch_model import load_torch_model
-from apex_ompl.training.validation import success_rates
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
@@ -101,7 +100,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 def main() -> None:
     """Train, evaluate, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--steps", type=one_or_more, default=3000, help="of each (default: %(default)s)")
     parser.add_argument("--threads", type=one_or_more, default=1, help="of each (default: %(default)s)")
     parser.add_argument("--jobs", type=one_or_more, default=2, help="trained at a time (default: %(default)s)")

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import load_model
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
@@ -46,14 +46,13 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.data import Mirror, shard_paths
 from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more, whole_number
+from apex_ompl.util.validation import whole_number
 from benchmarks.lib import record
-from benchmarks.lib.controls import Shuffled, checkpoint_digest, digest, drawn, next_query
-from benchmarks.lib.neighbors import Neighbors
+from benchmarks.lib.controls import Neighbors, Shuffled, checkpoint_digest, digest, drawn, next_query
 
 ROOT = record.ROOT
 FOLDER = record.RESULTS.parent / "runs" / "proposals"
-DEPENDS = ("@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/neighbors.py")
+DEPENDS = ("@benchmark", "benchmarks/lib/controls.py")
 COUNTS = (1, 8, 32)
 GUIDED = Guidance(gamma=1.0)
 PAPER = Sampling("ddpm", 256)
@@ -253,9 +252,8 @@ def _cells(f: dict[str, Any]) -> Iterator[str]:
 
 def main() -> None:
     """Run what is missing, and write the results of all."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=10, jobs=2)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=one_or_more, default=10, help="problems of a level (default: %(default)s)")
     parser.add_argument("--hard", type=whole_number, default=30, help="of a hard level (default: %(default)s)")
     parser.add_argument(
         "--paper", type=whole_number, default=5, help="of a level for apex-paper (default: %(default)s)"
@@ -263,7 +261,6 @@ def main() -> None:
     parser.add_argument(
         "--data", default=str(ROOT / "data" / "dual_panda_softhand" / "paths.zip"), help="for neighbors"
     )
-    parser.add_argument("--jobs", type=one_or_more, default=2, help="processes (default: %(default)s)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--methods", nargs="*", choices=list(METHODS), default=list(METHODS), metavar="NAME")
     parser.add_argument("--regression", default=str(ROOT / "benchmarks" / "runs" / "regression" / "checkpoint"))

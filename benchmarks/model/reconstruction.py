@@ -8,7 +8,6 @@ Usage: python -m benchmarks.model.reconstruction [-n 300] [--data FILE] [--model
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from apex_ompl.training.records import Paths
 from apex_ompl.training.store import load
 from apex_ompl.training.torch_model import load_torch_model
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 DEPENDS = ("apex_ompl/model", "apex_ompl/paths", "apex_ompl/training", "data/dual_panda_softhand")
@@ -60,8 +58,7 @@ def lost(name: str, paths: Paths, which: np.ndarray) -> dict[str, Any]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=300, help="paths (default: %(default)s)")
+    parser = record.parser(__doc__, n=300, of="paths")
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--models", nargs="*", default=list(shipped()), metavar="NAME|FOLDER")
     args = parser.parse_args()

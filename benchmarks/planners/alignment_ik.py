@@ -7,7 +7,6 @@ Usage: python -m benchmarks.planners.alignment_ik [--attempts 300]
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
@@ -46,7 +45,7 @@ def robot_with_bases_apart(distance: float) -> Robot:
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--attempts", type=one_or_more, default=300)
     parser.add_argument("--seed", type=whole_number, default=0)
     args = parser.parse_args()

@@ -12,7 +12,6 @@ Usage: python -m benchmarks.planners.apex_profile [-n 30]
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
@@ -162,7 +161,7 @@ def sprints(made: Sequence[Run]) -> tuple[dict[str, Any], list[str]]:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument(
         "-n", type=one_or_more, default=30, help="validation problems of a level (default: %(default)s)"
     )

@@ -11,7 +11,6 @@ FOLDER is another checkout, ``git worktree add FOLDER COMMIT`` makes one.
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
@@ -103,9 +102,8 @@ def table(before: list[dict[str, float]], after: list[dict[str, float]]) -> list
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=8)
     add_checkout(parser)
-    parser.add_argument("-n", type=one_or_more, default=8, help="problems of a level (default: %(default)s)")
     parser.add_argument("--seeds", type=one_or_more, default=2, help="seeds of each (default: %(default)s)")
     parser.add_argument("--split", default="validation", choices=("validation", "test"))
     parser.add_argument("--levels", nargs="+", default=list(HARD), metavar="LEVEL", help="(default: the hard ones)")

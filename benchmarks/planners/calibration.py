@@ -12,7 +12,6 @@ Usage: python -m benchmarks.planners.calibration [-n 50] [--rrt 20] [--jobs 2] [
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -116,12 +115,10 @@ def table(levels: Sequence[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=50, of="problems for rrtconnect", jobs=2)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=one_or_more, default=50, help="problems for rrtconnect (default: %(default)s)")
     parser.add_argument("--rrt", type=whole_number, default=20, help="problems for rrt (default: %(default)s)")
     parser.add_argument("--lines", type=one_or_more, default=100, help="problems for the line (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=2, help="runs at a time (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()

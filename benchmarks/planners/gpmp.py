@@ -10,14 +10,12 @@ Usage: python -m benchmarks.planners.gpmp [SUITE[/LEVEL] ...] [-n 12] [--jobs 1]
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.summary import statistics, warnings
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 from benchmarks.planners.head_to_head import together
 from benchmarks.planners.tune import TUNED_ON
@@ -42,10 +40,8 @@ def groups(levels: list[str]) -> dict[str, list[str]]:
 
 def main() -> None:
     """Run what is missing, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=12, jobs=1)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]", help="default: all static ones")
-    parser.add_argument("-n", type=one_or_more, default=12, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()
     levels = record.static_levels(args.levels)

@@ -18,7 +18,6 @@ Usage: python -m benchmarks.planners.head_to_head [SUITE[/LEVEL] ...] [-n 30] [-
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -37,7 +36,7 @@ from benchmarks.lib import record
 
 DEPENDS = (
     "@benchmark", "apex_ompl/baselines", "benchmarks/baselines", "benchmarks/lib/controls.py",
-    "benchmarks/lib/control_planners.py", "benchmarks/lib/neighbors.py",
+    "benchmarks/lib/control_planners.py",
 )  # fmt: skip
 FOLDER = Path(__file__).parents[1] / "runs" / "head_to_head"
 TIMEOUT = 10.0  # [s]
@@ -113,13 +112,11 @@ def together(
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=30, jobs=1)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=one_or_more, default=30, help="problems of a level (default: %(default)s)")
     parser.add_argument(
         "--slow", type=one_or_more, default=SLOW, help="of them for rows that take long (default: %(default)s)"
     )
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     workers = Workers(args.jobs, modules=("control_planners",))
     rows = [row if row.runs is None else replace(row, runs=args.slow) for row in ROWS]

@@ -10,7 +10,6 @@ Usage: python -m benchmarks.planners.imitation [-n 20] [--tune] [--models NAME|F
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +18,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl import planners, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.baselines.imitation.planner import Imitation
 from apex_ompl.baselines.imitation.policy import shared_policy
 from apex_ompl.goals.alignment import AlignmentGoal
@@ -34,7 +33,6 @@ from apex_ompl.timing.smoothness import jerk
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import make_folder
 from apex_ompl.util.statistics import share_interval
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 DEPENDS = ("@benchmark", "apex_ompl/baselines/imitation", "benchmarks/baselines/il", "benchmarks/baselines/il-paper")
@@ -176,8 +174,7 @@ def table(runs: Sequence[Run], labels: Sequence[str]) -> str:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=20, help="problems of each level (default: %(default)s)")
+    parser = record.parser(__doc__, n=20, of="problems of each level")
     parser.add_argument("--tune", action="store_true", help="compare ways of following chunks instead")
     parser.add_argument("--models", nargs="+", default=["il", "il-paper"], metavar="NAME|FOLDER")
     parser.add_argument("-o", "--out", type=Path, default=record.RESULTS, help="folder of the results")

@@ -9,7 +9,6 @@ Usage: python -m benchmarks.planners.kernel_start [--runs 10] [--install] [--num
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -43,7 +42,7 @@ STARTS = {
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--runs", type=one_or_more, default=10, help="(default: %(default)s)")
     parser.add_argument("--install", action="store_true", help="time README's first command in a new environment, too")
     parser.add_argument("--numba", action="store_true", help="time plans without the library, too")

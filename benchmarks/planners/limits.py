@@ -12,7 +12,6 @@ Usage: python -m benchmarks.planners.limits [--repeat 15]
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable
@@ -21,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import load_model, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.kernel.compiled.arrays import robot_view
 from apex_ompl.kernel.compiled.compilation import entry_point, reassociating_entry_point
 from apex_ompl.kernel.compiled.layout import Floats, Integers
@@ -164,7 +163,7 @@ def limits_of(limits: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--repeat", type=one_or_more, default=15, help="repetitions (default: %(default)s)")
     args = parser.parse_args()
     speed, rows = rates(args.repeat), stages(args.repeat)

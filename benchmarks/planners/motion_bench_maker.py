@@ -15,7 +15,6 @@ Usage: python -m benchmarks.planners.motion_bench_maker FOLDER [-n 30] [--jobs 1
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -40,7 +39,6 @@ from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import dump_yaml, read_yaml
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 from benchmarks.planners import peers
 
@@ -176,10 +174,8 @@ def tabulate(runs: Sequence[Run]) -> tuple[dict[str, Any], str]:
 
 def main() -> None:
     """Run what is missing, and write the results of all."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=30, of="problems of each set", jobs=1)
     parser.add_argument("folder", type=Path, help="the unpacked problems")
-    parser.add_argument("-n", type=one_or_more, default=30, help="problems of each set (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     files = converted(args.folder, args.n)
     results = bench(

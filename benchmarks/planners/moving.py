@@ -11,7 +11,6 @@ Usage: python -m benchmarks.planners.moving [-n 20] [--jobs 1] [--store FOLDER] 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +28,6 @@ from apex_ompl.problems.alignment import SIZES, SPEEDS, VELOCITY_SCALE
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.timing import time_path
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 DEPENDS = ("@benchmark", "apex_ompl/moving", "apex_ompl/timing")
@@ -117,9 +115,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=20, help="problems of each level (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: %(default)s)")
+    parser = record.parser(__doc__, n=20, of="problems of each level", jobs=1)
     parser.add_argument("--split", default="test", choices=("test", "validation"))
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")

@@ -11,7 +11,6 @@ Usage: python -m benchmarks.planners.overrun [--planner apex ...] [--share 1.0]
 
 from __future__ import annotations
 
-import argparse
 import re
 import tempfile
 from collections import Counter
@@ -170,7 +169,7 @@ def reasons(found: Sequence[Measured]) -> str:
 
 def main() -> None:
     """Make all runs, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--planner", action="append", choices=PLANNERS, default=[])
     parser.add_argument("--share", type=float, default=1.0, help="of the numbers of runs (default: %(default)s)")
     args = parser.parse_args()

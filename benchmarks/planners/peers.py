@@ -14,7 +14,6 @@ Usage: python -m benchmarks.planners.peers [SUITE[/LEVEL] ...] [-n 30] [--jobs 1
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -42,7 +41,6 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 try:
@@ -250,10 +248,8 @@ def tabulate(results: Results, levels: Sequence[str]) -> tuple[dict[str, Any], s
 
 def main() -> None:
     """Run what is missing, and write the results of all."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=30, jobs=1)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=one_or_more, default=30, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--name", default="peers", help="of the results (default: %(default)s)")

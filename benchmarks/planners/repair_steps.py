@@ -12,7 +12,6 @@ Usage: python -m benchmarks.planners.repair_steps [FOLDER ...] [-n 34] [--first 
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -21,8 +20,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.apex.models import NONE, Model, trajectory_model
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import NONE, Model, make_query, trajectory_model
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
@@ -122,13 +120,12 @@ def table(groups: dict[str, dict[str, dict[str, Any]]]) -> str:
 
 def main() -> None:
     """Run what is missing, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, jobs=2)
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="checkpoints beside the one that ships")
     parser.add_argument(
         "-n", type=one_or_more, default=FROZEN - TUNED_ON, help="problems of a level (default: %(default)s)"
     )
     parser.add_argument("--first", type=whole_number, default=TUNED_ON, help="left out before (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=2, help="runs at a time (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()

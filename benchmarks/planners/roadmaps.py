@@ -9,7 +9,6 @@ Usage: python -m benchmarks.planners.roadmaps [-n 8] [--jobs 1]
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +16,6 @@ from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.runs import NO_PROBLEM
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 from benchmarks.planners.tune import TUNED_ON
 
@@ -56,9 +54,7 @@ def table(results: Results) -> tuple[dict[str, Any], str]:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=8, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one)")
+    parser = record.parser(__doc__, n=8, jobs=1)
     args = parser.parse_args()
     results = bench(
         LEVELS, ROWS, FOLDER, runs=args.n, timeout=TIMEOUT, first=TUNED_ON, split="validation", simplify=False,

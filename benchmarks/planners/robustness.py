@@ -7,7 +7,6 @@ Usage: python -m benchmarks.planners.robustness [--solves 10000]
 
 from __future__ import annotations
 
-import argparse
 import gc
 import multiprocessing
 import sys
@@ -199,7 +198,7 @@ def pieces(count: int) -> Callable[[], tuple[str, bool]]:
 
 def main() -> None:
     """Do all of it."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--solves", type=one_or_more, default=10_000)
     args = parser.parse_args()
     checks: dict[str, Callable[[], tuple[str, bool]]] = {

@@ -5,14 +5,12 @@ Usage: python -m benchmarks.planners.sampling [-n 200] [SUITE[/LEVEL] ...]
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
 
 from apex_ompl import problems
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 DEPENDS = ("@checking", "problems")
@@ -21,9 +19,8 @@ FIRST = 100_000  # seed of the first problem, of the training split
 
 def main() -> None:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=200, of="problems a level")
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=one_or_more, default=200, help="problems a level (default: %(default)s)")
     args = parser.parse_args()
     every = [f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels]
     figures, rows = [], [["suite/level", "problems/s", "ms p50", "p95"], ["---", *["---:"] * 3]]

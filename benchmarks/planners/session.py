@@ -12,7 +12,6 @@ Usage: python -m benchmarks.planners.session [-n 100] [--fresh 20]
 
 from __future__ import annotations
 
-import argparse
 import math
 import subprocess
 import sys
@@ -126,7 +125,7 @@ def measure(names: list[str], fresh_names: list[str]) -> dict[str, list[tuple[fl
 
 def main() -> None:
     """Measure and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("-n", type=one_or_more, default=100, metavar="N", help="problems of a level")
     parser.add_argument("--fresh", type=one_or_more, default=20, metavar="N", help="of them in fresh processes")
     args = parser.parse_args()

@@ -10,7 +10,6 @@ Usage: python -m benchmarks.planners.shipped_problems [--planner rrtconnect] [--
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +22,7 @@ import numpy as np
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.evaluation import Row, Workers, bench, runs
-from apex_ompl.evaluation.log import short
+from apex_ompl.evaluation.results import short
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
 from apex_ompl.ompl import setup
@@ -100,7 +99,7 @@ def _times(values: dict[str, list[float]]) -> list[str]:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__)
     parser.add_argument("--planner", action="append", default=[])
     parser.add_argument("--seeds", type=one_or_more, default=20, help="runs on a problem (default: %(default)s)")
     parser.add_argument("--timeout", type=float, default=10.0)

@@ -10,19 +10,17 @@ Usage: python -m benchmarks.planners.standing [SUITE[/LEVEL] ...] [-n 30] [--job
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 
 from apex_ompl.evaluation import Row, Workers, bench
 from apex_ompl.evaluation.summary import statistics, warnings
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 from benchmarks.planners import head_to_head
 
 DEPENDS = (
-    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py", "benchmarks/lib/neighbors.py",
+    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py",
     "benchmarks/planners/head_to_head.py",
 )  # fmt: skip
 KINDS = ("hard", "large", "extreme")
@@ -38,10 +36,8 @@ ROWS = (
 
 def main() -> None:
     """Run what is missing, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=30, jobs=1)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=one_or_more, default=30, help="problems of a level (default: %(default)s)")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     levels = [level for level in record.static_levels(args.levels) if level.split("/")[1] in KINDS]
     if not levels:

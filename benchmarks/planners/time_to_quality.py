@@ -13,7 +13,6 @@ Usage: python -m benchmarks.planners.time_to_quality [--reference] [SUITE/hard .
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 import time
@@ -29,8 +28,8 @@ from apex_ompl import planners
 from apex_ompl.evaluation import Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.ompl.repair import simplify
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import path_to_array
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import full_check
@@ -39,7 +38,6 @@ from apex_ompl.problems import load
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 REFERENCE = Path(__file__).parents[1] / "reference_lengths.json"
@@ -185,11 +183,9 @@ def quality(done: dict[Any, Any], names: list[str], method: str, kept: dict[str,
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=10, of="test problems of a level", jobs=1)
     parser.add_argument("levels", nargs="*", metavar="SUITE/hard")
-    parser.add_argument("-n", type=one_or_more, default=10, help="test problems of a level (default: %(default)s)")
     parser.add_argument("--reference", action="store_true", help="make the reference lengths, 30 s for each problem")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     args = parser.parse_args()
     levels = [level for level in record.static_levels(args.levels) if level.endswith("/hard")]
     results = bench(

@@ -9,7 +9,6 @@ Usage: python -m benchmarks.planners.trees [-n 6] [--seeds 2]
 
 from __future__ import annotations
 
-import argparse
 import time
 from itertools import count
 from types import SimpleNamespace
@@ -20,7 +19,7 @@ from ompl import base as ob
 from tqdm import tqdm
 
 from apex_ompl import problems
-from apex_ompl.apex.trees import ompl_trees
+from apex_ompl.apex.stages.trees import ompl_trees
 from apex_ompl.kernel.search import TreePair
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
@@ -70,8 +69,7 @@ def compiled(ready: PlanningSetup, seed: int) -> tuple[Array | None, int, int]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=6, help="problems of a level (default: %(default)s)")
+    parser = record.parser(__doc__, n=6)
     parser.add_argument("--seeds", type=one_or_more, default=2, help="seeds of each (default: %(default)s)")
     args = parser.parse_args()
     names = [n for level in HARD for n in problems.frozen_names(*level.split("/"), "validation")[: args.n]]

@@ -21,7 +21,6 @@ Usage: python -m benchmarks.planners.tune [PLANNER ...] [--baselines] [--jobs 1]
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections.abc import Sequence
@@ -38,13 +37,12 @@ from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.evaluation.summary import Statistics
 from apex_ompl.problems.catalogue import VALIDATION
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 DEPENDS = (
     "@checking", "apex_ompl/apex", "apex_ompl/api.py", "apex_ompl/evaluation", "apex_ompl/model",
     "apex_ompl/ompl/own_planner.py", "apex_ompl/ompl/parameters.py", "apex_ompl/ompl/repair.py",
-    "apex_ompl/ompl/setup.py", "apex_ompl/ompl/simplify.py", "apex_ompl/ompl/space.py", "apex_ompl/ompl/validity.py",
+    "apex_ompl/ompl/setup.py", "apex_ompl/ompl/space.py", "apex_ompl/ompl/validity.py",
     "apex_ompl/planning", "apex_ompl/result.py", "apex_ompl/baselines", "apex_ompl/goals", "apex_ompl/paths",
     "benchmarks/baselines", "benchmarks/planners/peers.py", "planners", "problems",
 )  # fmt: skip
@@ -286,8 +284,7 @@ def _cells(f: dict[str, Any]) -> list[Any]:
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
+    parser = record.parser(__doc__, jobs=1)
     parser.add_argument("--baselines", action="store_true", help="tune the baselines of the paper instead")
     parser.add_argument("planners", nargs="*", metavar="PLANNER", help="only these; the others' results stay")
     args = parser.parse_args()

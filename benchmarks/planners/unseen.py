@@ -15,7 +15,6 @@ Usage: python -m benchmarks.planners.unseen [LEVEL ...] [-n 34] [--first 16] [--
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +31,7 @@ from benchmarks.lib.controls import checkpoint_digest
 from benchmarks.planners.head_to_head import ROWS, TREELESS, together
 
 DEPENDS = (
-    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py", "benchmarks/lib/neighbors.py",
+    "@benchmark", "benchmarks/lib/controls.py", "benchmarks/lib/control_planners.py",
     "benchmarks/planners/head_to_head.py",
 )  # fmt: skip
 FOLDER = record.RESULTS.parent / "runs" / "unseen"
@@ -70,7 +69,7 @@ def rows(names: Sequence[str], model: Path | None) -> list[Row]:
 
 def main() -> None:
     """Run what is missing, and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, jobs=1)
     parser.add_argument("levels", nargs="*", metavar="LEVEL", help="of unseen (default: all)")
     parser.add_argument(
         "-n", type=one_or_more, default=FROZEN - TUNED_ON, help="problems of a level (default: %(default)s)"
@@ -78,7 +77,6 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=TUNED_ON, help="those left out before (default: %(default)s)")
     parser.add_argument("--rows", nargs="*", choices=NAMES, default=NAMES, metavar="NAME", help="(default: all)")
     parser.add_argument("--model", type=Path, metavar="FOLDER", help="checkpoint beside the one that ships")
-    parser.add_argument("--jobs", type=one_or_more, default=1, help="runs at a time (default: one, as they are timed)")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     args = parser.parse_args()

@@ -10,7 +10,6 @@ Usage: python -m benchmarks.planners.viewer [-n 20]
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -21,7 +20,6 @@ from apex_ompl import load_problem, plan, problems
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.validation import one_or_more
 from apex_ompl.viz.viewer.editor import GOAL
 from apex_ompl.viz.viewer.live_page import PERIOD, LivePage
 from apex_ompl.viz.viewer.page import write_page
@@ -85,8 +83,7 @@ def steps(problem: Problem) -> list[float]:
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=one_or_more, default=20, help="problems (default: %(default)s)")
+    parser = record.parser(__doc__, n=20, of="problems")
     args = parser.parse_args()
     names = [name for level in LEVELS for name in problems.frozen_names(*level.split("/"), "validation")]
     names = names[:: max(1, len(names) // args.n)][: args.n]

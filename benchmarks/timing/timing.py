@@ -21,7 +21,6 @@ Usage: python -m benchmarks.timing.timing [SUITE[/LEVEL] ...] [-n 18] [--others 
 
 from __future__ import annotations
 
-import argparse
 import io
 import time
 from collections.abc import Callable
@@ -47,7 +46,7 @@ from apex_ompl.timing.curve import Polyline
 from apex_ompl.timing.parameterization import METHODS
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
-from apex_ompl.util.validation import one_or_more, whole_number
+from apex_ompl.util.validation import whole_number
 from benchmarks.lib import record
 from benchmarks.timing.timing_methods import (
     EACH,
@@ -187,9 +186,8 @@ OTHERS: dict[str, Method] = {
 
 def main() -> None:
     """Time paths, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = record.parser(__doc__, n=18)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
-    parser.add_argument("-n", type=one_or_more, default=18, help="problems of a level (default: %(default)s)")
     parser.add_argument(
         "--others", type=whole_number, default=3, help="of them for the other methods (default: %(default)s)"
     )

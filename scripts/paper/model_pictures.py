@@ -14,7 +14,7 @@ import numpy as np
 from paper.figure import Made, blank
 
 from apex_ompl import load_model, load_problem
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.evaluation.metrics import diversity as mean_distance
 from apex_ompl.evaluation.summary import Table
 from apex_ompl.kernel import Kernel

@@ -14,7 +14,7 @@ import torch
 from tqdm import tqdm
 
 from apex_ompl import problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.evaluation import Row
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run

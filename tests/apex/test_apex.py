@@ -16,8 +16,8 @@ from support import ROOT
 
 from apex_ompl import plan, planners
 from apex_ompl.apex.parameters import ApexParameters
-from apex_ompl.apex.start_goal import read_goals
 from apex_ompl.model.proposals import TrajectoryModel
+from apex_ompl.ompl.own_planner import read_goals
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.space import path_to_array, state_space, to_state
 from apex_ompl.ompl.validity import StateValidityChecker, full_check

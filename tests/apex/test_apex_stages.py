@@ -16,7 +16,7 @@ from apex_ompl import plan, planners
 from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.stages import Propose, Solution, TakeTurns, shorten
-from apex_ompl.apex.stages.turns import ITERATIONS
+from apex_ompl.apex.stages.trees import ITERATIONS
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path, path_length, resample

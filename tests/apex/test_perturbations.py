@@ -10,9 +10,7 @@ from planning import HARD, cached_problem
 from support import ROOT
 
 from apex_ompl import plan, run
-from apex_ompl.apex.models import has_model, trajectory_model
-from apex_ompl.apex.perturbations import PerturbationModel
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import PerturbationModel, has_model, make_query, trajectory_model
 from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from apex_ompl.baselines.gpmp.gaussian_process import BlockTridiagonal, GaussianProcess
 from apex_ompl.baselines.gpmp.optimizer import CostFunctional, FactorGraph
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.clearance_costs import ClearanceCosts
+from apex_ompl.kernel.path import ClearanceCosts
 
 EPS, CENTER, RADIUS = 0.3, np.array([0.5, 0.45]), 0.25
 

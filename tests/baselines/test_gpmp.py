@@ -14,7 +14,7 @@ from apex_ompl.baselines.gpmp.planner import GaussianProcessPlanner
 from apex_ompl.baselines.gpmp.replanner import IncrementalGPMP, IncrementalGPMP2
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.kernel.clearance_costs import clearance_costs
+from apex_ompl.kernel.path import clearance_costs
 from apex_ompl.loop.replan.methods import named
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import Following

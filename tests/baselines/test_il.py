@@ -17,7 +17,7 @@ from planning import cached_problem, within
 from support import ROOT, needs
 
 from apex_ompl import plan, planners
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.baselines.imitation import policy as policies
 from apex_ompl.baselines.imitation.checkpoint import save_policy
 from apex_ompl.baselines.imitation.policy import shared_policy

@@ -12,7 +12,7 @@ from support import ROOT
 from apex_ompl import problems
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
 from apex_ompl.kernel import Kernel, RobotTables
-from apex_ompl.kernel.table_checks import MADE
+from apex_ompl.kernel.tables import MADE
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.optimizer import Optimizer

@@ -269,3 +269,13 @@ def test_the_kernel_alone_proves_what_the_spheres_prove(checker: CollisionChecke
     for path, resolution in ((robot.home[None], 0.01), (np.stack([robot.home] * 2), 0.0)):
         with pytest.raises(ParameterError, match="path|resolution"):
             checker.kernel.proves(path, resolution)
+
+
+def test_boxes_leave_no_pair_out_that_touches(robot: Robot, tmp_path: Path) -> None:
+    rng = np.random.default_rng(6)
+    _, meshes = checkers(robot, clutter(rng, tmp_path / "step.obj"), held(robot))
+    stage = meshes.meshes
+    states = [robot.to_pinocchio(q) for q in states_around_home(robot, rng, 60, 0.5)]
+    found = [stage.collides(q) for q in states]
+    assert found == [stage.any_collides(q, stage.pairs) for q in states]
+    assert 5 < sum(found) < 55

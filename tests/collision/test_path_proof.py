@@ -72,7 +72,7 @@ def test_clearance_of_a_path_holds_at_dense_states(grazing: ModuleType, robot: R
             dense = np.concatenate(
                 [a + np.linspace(0, 1, 13)[:, None] * (b - a) for a, b in zip(path, path[1:], strict=False)]
             )
-            least = min(distances(q, distances.scene.pairs).min() for q in dense)
+            least = min(distances.nearest(q)[0] for q in dense)
             assert proof.clearance_bound <= least + 1e-7
             assert proof.clearance_bound >= proof.clearance - TOLERANCE
             at = Curve.polyline(path)
@@ -119,7 +119,7 @@ def test_motions_are_proved_along_their_cubic_pieces(tmp_path: Path, grazing: Mo
             states = motion.sample(motion.duration / 50).position
             if check:
                 proved += 1
-                least = min(distances(q, distances.scene.pairs).min() for q in states)
+                least = min(distances.nearest(q)[0] for q in states)
                 assert check.proof is not None and check.proof.clearance_bound <= least + 1e-7
                 assert check.proof.clearance <= least + 5e-3
             else:
@@ -249,6 +249,6 @@ def test_clearance_to_a_hull_of_many_corners(grazing: ModuleType, robot: Robot, 
     for q in states_around_home(robot, np.random.default_rng(0), 100, 0.5):
         if checker.is_free(q):
             proof = checker.prove(q[None])
-            assert proof.clearance == pytest.approx(distances(q, distances.scene.pairs).min(), abs=TOLERANCE)
+            assert proof.clearance == pytest.approx(distances.nearest(q)[0], abs=TOLERANCE)
             pairs.append(proof.pair[1])
     assert pairs.count("ball") > 3

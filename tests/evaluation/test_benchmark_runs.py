@@ -72,6 +72,6 @@ def test_success_is_the_full_check_and_a_dead_process_is_a_crash(tmp_path: Path)
 
 def test_first_paths_of_planners_that_use_all_their_time_are_noticed() -> None:
     for name in ("aorrtc", "informedrrtstar"):
-        found = runs.run(Job("x", "wall/easy/800000", name, name, {}, 0, 3.0, True))
+        found = runs.run(Job("x", "wall/easy/800000", name, name, {}, 0, 1.5, True))
         assert found["solved"] and found["raw_length"] is None
         assert 0.0 < found["first"] < 0.5 * found["total"], name

@@ -37,9 +37,14 @@ def names_in(script: Path) -> set[str]:
     return found
 
 
+@pytest.fixture(scope="module")
+def siblings() -> dict[str, set[str]]:
+    """Names of each benchmark's module."""
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts): names_in(path) for path in SCRIPTS}
+
+
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_what_benchmarks_take_from_each_other_is_there(script: Path) -> None:
-    siblings = {".".join(path.relative_to(ROOT).with_suffix("").parts): names_in(path) for path in SCRIPTS}
+def test_what_benchmarks_take_from_each_other_is_there(script: Path, siblings: dict[str, set[str]]) -> None:
     tree = ast.parse(script.read_text())
     imported = names_in(script)
     for node in ast.walk(tree):

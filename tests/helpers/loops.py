@@ -19,8 +19,7 @@ from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.problems.world_scripts import environment_of
-from apex_ompl.problems.worlds import DynamicEnvironment
+from apex_ompl.problems.worlds import DynamicEnvironment, environment_of
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.spline_method import least_knot_spacing

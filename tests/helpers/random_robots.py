@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.kernel import robot_builder, robot_specs
+from apex_ompl.kernel import robot_builder
 from apex_ompl.kernel.arrays import FIXED, PRISMATIC, REVOLUTE
 from apex_ompl.kernel.joint_tree import JointTree
-from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.tables import BodySpec, JointSpec, RobotTables
 
 
 def unit(rng: np.random.Generator) -> np.ndarray:
@@ -37,16 +37,16 @@ def balls(rng: np.random.Generator, leaves: int) -> dict[str, np.ndarray]:
 def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables, list, list, list]:
     """Tables, joints, bodies and pairs of a random tree of revolute, prismatic, fixed and mimic joints."""
     rng = np.random.default_rng(seed)
-    specs = [robot_specs.JointSpec(0)]
+    specs = [JointSpec(0)]
     for k in range(1, joints):
         kind = int(rng.choice([REVOLUTE, REVOLUTE, PRISMATIC, FIXED]))
         specs.append(
-            robot_specs.JointSpec(
+            JointSpec(
                 int(rng.integers(0, k)), kind, pose(rng, 0.2), unit(rng), -1 if kind == FIXED else k % dof,
                 float(rng.uniform(-1.5, 1.5)), float(rng.normal(0.0, 0.3)),
             )
         )  # fmt: skip
-    bodies = [robot_specs.BodySpec(f"b{k}", k, pose(rng, 0.05), **balls(rng, 3)) for k in range(joints)]
+    bodies = [BodySpec(f"b{k}", k, pose(rng, 0.05), **balls(rng, 3)) for k in range(joints)]
     pairs = [(a, b) for a in range(joints) for b in range(a) if rng.random() < 0.5]
     names = [f"q{k}" for k in range(dof)]
     box = np.ones(dof)
@@ -59,9 +59,9 @@ def random_robot(seed: int, joints: int = 9, dof: int = 4) -> tuple[RobotTables,
 def random_hand(seed: int) -> tuple[RobotTables, list, list, list]:
     """The same of hands: two to six fingers that follow one joint, on a wrist or fixed to the world."""
     rng = np.random.default_rng(seed)
-    specs = [robot_specs.JointSpec(0)]
+    specs = [JointSpec(0)]
     if rng.random() < 0.7:
-        specs.append(robot_specs.JointSpec(0, REVOLUTE, pose(rng, 0.3), unit(rng), 0, 1.0, 0.0))
+        specs.append(JointSpec(0, REVOLUTE, pose(rng, 0.3), unit(rng), 0, 1.0, 0.0))
     palm = len(specs) - 1
     for _ in range(int(rng.integers(2, 7))):
         parent = palm
@@ -69,15 +69,13 @@ def random_hand(seed: int) -> tuple[RobotTables, list, list, list]:
             kind = int(rng.choice([REVOLUTE, REVOLUTE, REVOLUTE, PRISMATIC, FIXED]))
             ratio, shift = float(rng.uniform(-1.0, 1.5)), float(rng.normal(0.0, 0.2))
             source = -1 if kind == FIXED else 1
-            specs.append(robot_specs.JointSpec(parent, kind, pose(rng, 0.1), unit(rng), source, ratio, shift))
+            specs.append(JointSpec(parent, kind, pose(rng, 0.1), unit(rng), source, ratio, shift))
             parent = len(specs) - 1
     bodies = []
     for k in range(len(specs)):
         for _ in range(int(rng.integers(1, 3))):
             meets = bool(rng.random() < 0.8)
-            bodies.append(
-                robot_specs.BodySpec(f"b{len(bodies)}", k, pose(rng, 0.03), meets_scene=meets, **balls(rng, 3))
-            )
+            bodies.append(BodySpec(f"b{len(bodies)}", k, pose(rng, 0.03), meets_scene=meets, **balls(rng, 3)))
     count = len(bodies)
     pairs = [
         (a, b) for a in range(count) for b in range(a) if bodies[a].joint != bodies[b].joint and rng.random() < 0.3

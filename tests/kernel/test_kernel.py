@@ -17,13 +17,13 @@ from support import states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.tables import primitives
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel import Kernel, robot_builder, robot_specs
+from apex_ompl.kernel import Kernel, robot_builder
 from apex_ompl.kernel.compiled.arrays import PRISMATIC
 from apex_ompl.kernel.compiled.check import motion_proof, queries
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.library import is_used
 from apex_ompl.kernel.scene_builder import scene_tables
-from apex_ompl.kernel.tables import RobotTables
+from apex_ompl.kernel.tables import BodySpec, JointSpec, RobotTables
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 
@@ -113,15 +113,15 @@ def test_clearance_of_random_trees_is_that_of_all_spheres(seed: int, make: Any) 
 
 def single_ball() -> RobotTables:
     """A ball of 1 cm on three sliders: its state is where it is."""
-    specs = [robot_specs.JointSpec(0)]
-    specs += [robot_specs.JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
+    specs = [JointSpec(0)]
+    specs += [JointSpec(k, PRISMATIC, np.eye(4), np.eye(3)[k], k) for k in range(3)]
     cover = {
         "centers": np.zeros((1, 3)),
         "radii": np.array([0.01]),
         "first": np.zeros(1, int),
         "count": np.zeros(1, int),
     }
-    body = robot_specs.BodySpec("ball", 3, np.eye(4), **cover)
+    body = BodySpec("ball", 3, np.eye(4), **cover)
     box = 10.0 * np.ones(3)
     return robot_builder.robot_tables(
         "ball", "xyz", lower=-box, upper=box, tree=JointTree(specs), bodies=[body], pairs=[]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.sensor import Sensor, SensorStream
-from apex_ompl.problems.world_scripts import ScriptedEnvironment
+from apex_ompl.problems.worlds import ScriptedEnvironment
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem

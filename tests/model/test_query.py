@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from apex_ompl import load_problem
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.model.geometry import signed_distances
 from apex_ompl.model.query import ObstacleSet

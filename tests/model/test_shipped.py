@@ -9,7 +9,7 @@ import pytest
 from support import DATA, ROOT, needs
 
 from apex_ompl import load_model, load_problem
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.kernel import Kernel
 from apex_ompl.model.checkpoint import SHIPPED, shipped
 from apex_ompl.model.guidance import EQUATION_7
@@ -20,9 +20,8 @@ from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.training.kernel_problems import load_kernel_problems
+from apex_ompl.training.kernel_problems import load_kernel_problems, query_from_problem
 from apex_ompl.training.store import load
-from apex_ompl.training.validation import query_from_problem
 
 FULL = ROOT / "data" / "dual_panda_softhand"
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from ompl import base as ob
 
-from apex_ompl.ompl.interrupt import Interrupt
+from apex_ompl.ompl.process import Interrupt
 
 LIBC = ctypes.CDLL(None)
 LIBC.signal.restype = ctypes.c_void_p

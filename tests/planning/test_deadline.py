@@ -16,10 +16,9 @@ from apex_ompl.api import load_problem, plan
 from apex_ompl.errors import TimingStoppedError
 from apex_ompl.evaluation import runs
 from apex_ompl.evaluation.rows import Job
-from apex_ompl.ompl.interrupt import ends_after
-from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.process import ends_after
+from apex_ompl.ompl.repair import repair, simplify
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import to_state
 from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
 from apex_ompl.paths.path import SEARCH_RESOLUTION, Path

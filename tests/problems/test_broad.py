@@ -16,7 +16,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.problems import broad_parts, generator
+from apex_ompl.problems import broad_parts, catalogue
 from apex_ompl.problems.broad import GRAMMARS
 from apex_ompl.problems.broad_parts import site
 from apex_ompl.problems.broad_representation import (
@@ -30,9 +30,8 @@ from apex_ompl.problems.broad_representation import (
     part_of,
 )  # fmt: skip
 from apex_ompl.problems.broad_tasks import KINDS, OPEN, clear_parts, difficulty, draw_held, scene_of, sprint
-from apex_ompl.problems.catalogue import ProblemId
+from apex_ompl.problems.catalogue import ProblemId, first_drawn
 from apex_ompl.problems.frozen import digest
-from apex_ompl.problems.generator import first_drawn
 from apex_ompl.problems.suite_robot import empty_hand_tables
 from apex_ompl.robot import Robot
 from apex_ompl.training.units import Unit, plan_units, problem_record
@@ -175,7 +174,7 @@ def test_classes_of_difficulty_are_in_order(robot: Robot) -> None:
 
 def test_obstacles_of_a_problem_as_primitives_are_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = problems.load("broad/boulders/7")
-    monkeypatch.setattr(generator, "draw", None)
+    monkeypatch.setattr(catalogue, "draw", None)
     assert len(problems.primitives(problem, enclosing=True)) > 0
 
 

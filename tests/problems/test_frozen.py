@@ -19,8 +19,7 @@ from apex_ompl.moving.timed_proof import check_timed_path
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import resample
 from apex_ompl.problems import frozen
-from apex_ompl.problems.catalogue import ProblemId
-from apex_ompl.problems.generator import first_drawn
+from apex_ompl.problems.catalogue import ProblemId, first_drawn
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle

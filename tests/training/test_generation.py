@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,7 +125,7 @@ def script(*arguments: object, **options: object) -> subprocess.CompletedProcess
 SMALL = ("vertical/small", "wall/easy", "broad/free", "--problems", 60, "--parts", 1, "--quiet")
 
 
-def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path) -> None:
+def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path, script_here: Any) -> None:
     whole = script(tmp_path / "whole", *SMALL)
     assert whole.returncode == 0, whole.stderr
     wanted = Store(tmp_path / "whole")
@@ -144,45 +145,40 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path) -> No
     assert all(same(killed.read(name), wanted.read(name)) for name in wanted.units())
     assert all((units / name).stat().st_mtime_ns == stamp for name, stamp in before.items()), "made once"
     assert killed.manifest["counts"] == wanted.manifest["counts"]
-    again = script(tmp_path / "killed", *SMALL)
+    again = script_here(SCRIPT.name, tmp_path / "killed", *SMALL)
     assert again.returncode == 0 and "nothing was left to do" in again.stdout
 
 
-def test_a_set_is_described_and_made_compact(made: list[Paths], tmp_path: Path) -> None:
+def test_a_set_is_described_and_made_compact(made: list[Paths], tmp_path: Path, script_here: Any) -> None:
     store = Store.create(tmp_path / "data", {}, {})
     for unit, paths in zip(UNITS, made, strict=True):
         store.write(unit.name, paths)
-    command = [sys.executable, str(SCRIPT.parent / "compact_data.py"), str(tmp_path / "data"), str(tmp_path / "c.zip")]
-    assert subprocess.run(command, check=False, capture_output=True).returncode == 0
+    command = ("compact_data.py", tmp_path / "data", tmp_path / "c.zip")
+    assert script_here(*command).returncode == 0
     size = 0.8 * (tmp_path / "c.zip").stat().st_size
     assert len(load(tmp_path / "c.zip")) == sum(map(len, made))
-    done = subprocess.run([*command, "--mib", str(size / 2**20)], check=False, capture_output=True, text=True)
+    done = script_here(*command, "--mib", size / 2**20)
     assert done.returncode == 0, done.stderr
     few, all_of_them = load(tmp_path / "c.zip"), Paths.concatenate(store)
     assert (tmp_path / "c.zip").stat().st_size <= size
     assert few.problems == all_of_them.problems and 10 < len(few) < len(all_of_them)
     parts = SOURCES.index("part")
     assert (few.arrays["source"] != parts).sum() == (all_of_them.arrays["source"] != parts).sum(), "parts go first"
-    done = subprocess.run([*command, "--mib", "0.001"], check=False, capture_output=True, text=True)
+    done = script_here(*command, "--mib", "0.001")
     assert done.returncode == 2 and "expected a higher limit" in done.stderr
-    command = [sys.executable, str(SCRIPT.parent / "describe_data.py"), str(tmp_path / "c.zip")]
-    done = subprocess.run(
-        [*command, "--out", str(tmp_path), "--check", "5", "--motions", "2"],
-        check=False,
-        capture_output=True,
-        text=True,
-    )
+    command = ("describe_data.py", tmp_path / "c.zip")
+    done = script_here(*command, "--out", tmp_path, "--check", "5", "--motions", "2")
     assert done.returncode == 0, done.stderr
     text = (tmp_path / "description.md").read_text()
     assert f"{len(few)} paths of {few.problems} problems" in text
     assert "5 of 5 random paths pass the full check" in text
     for name in ("figures.png", "motions.jpg"):
         assert (tmp_path / name).stat().st_size > 10_000
-    done = subprocess.run([*command, "--out", "/nowhere"], check=False, capture_output=True, text=True)
+    done = script_here(*command, "--out", "/nowhere")
     assert done.returncode == 2 and "does not exist" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_faults_of_the_command_are_sentences(tmp_path: Path) -> None:
+def test_faults_of_the_command_are_sentences(tmp_path: Path, script_here: Any) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "manifest.json").write_text('{"schema": "apex-ompl/dataset/0"}')
@@ -195,7 +191,7 @@ def test_faults_of_the_command_are_sentences(tmp_path: Path) -> None:
         ((tmp_path / "new", "wall/easy", "--address", "127.0.0.1:1"), "Ray"),
     ]
     for arguments, words in cases:
-        result = script(*arguments)
+        result = script_here(SCRIPT.name, *arguments)
         assert result.returncode == 2 and words in result.stderr and "Traceback" not in result.stderr, result.stderr
     assert not (tmp_path / "new" / "units").exists() or not list((tmp_path / "new" / "units").iterdir())
 

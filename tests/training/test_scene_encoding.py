@@ -16,7 +16,7 @@ from support import ROOT
 from trainings import HERE, config, query_from_path
 
 from apex_ompl import load_model, plan, problems
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import Kernel

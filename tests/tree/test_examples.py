@@ -20,6 +20,9 @@ def test_an_example_runs(example: Path, tmp_path: Path) -> None:
     done = subprocess.run(command, check=False, capture_output=True, text=True, cwd=tmp_path, timeout=120)
     assert done.returncode == 0, done.stderr
     assert done.stdout
+    if example.stem == "06_ompl_benchmark":
+        assert "RRTConnect: EXACT_SOLUTION" in done.stdout and "1/1 solved" in done.stdout
+        assert (tmp_path / "ompl_benchmark.log").read_text().startswith("OMPL version")
 
 
 @pytest.mark.parametrize("example", [one for one in EXAMPLES if "_own_" in one.stem], ids=lambda path: path.stem)

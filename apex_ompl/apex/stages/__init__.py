@@ -4,14 +4,11 @@ A stage is a small record of its parameters with one method, ``run(context)``. T
 chosen by ``apex_ompl.apex.parameters.ApexParameters.stages``.
 """
 
-from apex_ompl.apex.stages.anytime import Anytime
-from apex_ompl.apex.stages.bridging import Bridging, NearestToGoal
 from apex_ompl.apex.stages.known import CheckKnown, KnownCandidates
 from apex_ompl.apex.stages.proposals import Farthest, Propose, Repair, Resample, proposal_round
-from apex_ompl.apex.stages.shorten import Shorten
+from apex_ompl.apex.stages.shorten import Anytime, Shorten
 from apex_ompl.apex.stages.stage import Solution, Stage, run_stage
-from apex_ompl.apex.stages.trees import GrowTrees, Sprint
-from apex_ompl.apex.stages.turns import TEMPERATURES, TakeTurns
+from apex_ompl.apex.stages.trees import TEMPERATURES, Bridging, GrowTrees, NearestToGoal, Sprint, TakeTurns
 
 __all__ = [
     "TEMPERATURES",

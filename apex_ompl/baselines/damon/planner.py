@@ -11,7 +11,6 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.start_goal import read_goals, read_starts
 from apex_ompl.baselines.damon.latent_graph import Damon
 from apex_ompl.baselines.damon.manifold import shared_manifold
 from apex_ompl.kernel import Kernel
@@ -55,15 +54,10 @@ class DAMON(OwnPlanner):
         before, self.validator = self.validator, self.validator.current()
         if self.validator is not before:
             self._hit.clear()
-        started, inputs, dof = time.perf_counter(), self.getPlannerInputStates(), self.validator.checker.robot.dof
-        starts = read_starts(inputs, dof)
-        goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
-        if not starts:
-            self.report.reason = "no start state is valid"
-            return Status.INVALID_START
-        if not goals:
-            self.report.reason = "no valid goal state was sampled"
-            return Status.TIMEOUT if ptc() else Status.INVALID_GOAL
+        started = time.perf_counter()
+        starts, goals, status = self._ends(ptc)
+        if status is not None:
+            return status
         with self.report.timed("nodes"):
             states = self.damon.states(starts[0])
             usable, free_nodes = self._nodes(states)

@@ -11,7 +11,6 @@ import numpy as np
 from ompl import base as ob
 from ompl import util as ou
 
-from apex_ompl.apex.start_goal import read_goals, read_starts
 from apex_ompl.baselines.drrt.dynamic_rrt import DynamicRRT, GoalTree
 from apex_ompl.collision.path_proof import may_have_become_blocked
 from apex_ompl.kernel import Kernel
@@ -66,15 +65,9 @@ class DRRT(OwnPlanner):
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.removed = 0
         si, started = self.getSpaceInformation(), time.perf_counter()
-        dof, inputs = int(si.getStateDimension()), self.getPlannerInputStates()
-        starts = read_starts(inputs, dof)
-        goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
-        if not starts:
-            self.report.reason = "no start state is valid"
-            return Status.INVALID_START
-        if not goals:
-            self.report.reason = "no valid goal state was sampled"
-            return Status.TIMEOUT if ptc() else Status.INVALID_GOAL
+        starts, goals, status = self._ends(ptc)
+        if status is not None:
+            return status
         first = self._seed if self._seed >= 0 else int(ou.RNG().uniformInt(0, 2**31 - 2))
         rng, box = np.random.default_rng(first + self._solves), si.getStateSpace().getBounds()
         self._solves += 1

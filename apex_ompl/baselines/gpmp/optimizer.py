@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from apex_ompl.baselines.gpmp.gaussian_process import BlockTridiagonal, GaussianProcess
-from apex_ompl.kernel.clearance_costs import ClearanceCosts
+from apex_ompl.kernel.path import ClearanceCosts
 from apex_ompl.types import Array
 
 Clearances = Callable[[Array, Array], ClearanceCosts]

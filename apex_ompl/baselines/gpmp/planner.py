@@ -13,13 +13,12 @@ from ompl import base as ob
 from ompl import util as ou
 
 from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
-from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
 from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
 from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Optimum
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
-from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.kernel.path import ClearanceCosts, clearance_costs
+from apex_ompl.ompl.own_planner import OwnPlanner, nearest_pairs
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import bounds_of
 from apex_ompl.ompl.tuned import TUNED
@@ -210,13 +209,11 @@ class GaussianProcessPlanner(OwnPlanner):
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.validator, self.optima = self.validator.current(), []
         validator, checker = self.validator, self.validator.checker
-        started, report, inputs = time.perf_counter(), self.report, self.getPlannerInputStates()
+        started, report = time.perf_counter(), self.report
         lower, upper = bounds_of(self.getSpaceInformation(), checker.robot)
-        starts = read_starts(inputs, len(lower))
-        goals = read_goals(inputs, len(lower), ptc, self.getProblemDefinition().getGoal())
-        if not starts or not goals:
-            report.reason = "no valid start" if not starts else "no valid goal"
-            return Status.INVALID_START if not starts else Status.INVALID_GOAL
+        starts, goals, status = self._ends(ptc)
+        if status is not None:
+            return status
         process = GaussianProcess(self.parameters.intervals, power=self.parameters.power)
         problem = self.parameters.problem(process, checker, lower, upper)
         for supports in self._initial(process, nearest_pairs(starts, goals)):

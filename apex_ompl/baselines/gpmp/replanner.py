@@ -11,7 +11,7 @@ import numpy as np
 from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
 from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Factors, Optimum
 from apex_ompl.baselines.gpmp.planner import GPMP, GPMP2, GaussianProcessParameters
-from apex_ompl.kernel.clearance_costs import ClearanceCosts, clearance_costs
+from apex_ompl.kernel.path import ClearanceCosts, clearance_costs
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register

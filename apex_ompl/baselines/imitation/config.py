@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from apex_ompl.model.config import Count, Size
-from apex_ompl.training.config import MirrorConfig, Positive, Share, TrainingFile
+from apex_ompl.training.config import Positive, TrainingFile
 from apex_ompl.util.schema import StrictModel
 
 
@@ -51,10 +51,10 @@ class NetworkConfig(StrictModel):
 class ImitationConfig(TrainingFile):
     """Configuration of ``scripts/train_il.py``; attributes are keys of the file.
 
+    Those of every training are described in :class:`~apex_ompl.training.config.TrainingFile`.
+
     Attributes:
         schema_: Version of the format.
-        data: Folder of a data set, or a file of paths; or several.
-        robot: File of the robot's kernel tables.
         network: The transformer.
         init: Folder of a policy whose weights are the first ones, where their shapes are the same; random by default.
         steps: Number of steps. It may be changed until ``cooldown`` steps before the end, as all before is the same.
@@ -64,21 +64,9 @@ class ImitationConfig(TrainingFile):
         rate: Largest learning rate; it rises linearly over ``warmup`` steps, and falls linearly to 0 at the end.
         warmup: Number of steps of the rise.
         cooldown: Number of steps of the fall.
-        decay: Weight decay.
-        clip: Largest norm of the gradient.
-        ema: Decay of the exponential moving average of the weights.
-        precision: ``float32`` or ``bfloat16`` (mixed).
-        seed: Seed of all random choices.
-        weights: Relative frequency of paths, by patterns of ``suite/level``; the first that matches counts, else 1.
-        mirror: Mirror symmetry of the robot, by which the data are augmented.
-        held_out: Share of the problems kept for the validation loss.
-        log_every: Steps between two lines of the log.
-        save_every: Seconds between two saves.
     """
 
     schema_: Literal["apex-ompl/imitation-training/1"] = Field(alias="schema")
-    data: str | Annotated[tuple[str, ...], Field(min_length=1)]
-    robot: str
     network: NetworkConfig
     init: str | None = None
     steps: Count = 10_000
@@ -88,21 +76,6 @@ class ImitationConfig(TrainingFile):
     rate: Positive = 1e-3
     warmup: Count = 200
     cooldown: Count = 1500
-    decay: Annotated[float, Field(ge=0.0)] = 1e-2
-    clip: Positive = 1.0
-    ema: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.999
-    precision: Literal["float32", "bfloat16"] = "float32"
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    weights: dict[str, Annotated[float, Field(ge=0.0)]] = {}
-    mirror: MirrorConfig | None = None
-    held_out: Share = 0.02
-    log_every: Count = 100
-    save_every: Positive = 120.0
-
-    @property
-    def sources(self) -> tuple[str, ...]:
-        """Data sets as a tuple."""
-        return (self.data,) if isinstance(self.data, str) else self.data
 
     @property
     def determining(self) -> str:

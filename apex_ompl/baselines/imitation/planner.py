@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from ompl import base as ob
 
+from apex_ompl.apex.models import make_query
 from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
-from apex_ompl.apex.query import make_query
-from apex_ompl.apex.start_goal import nearest_pairs, read_goals, read_starts
-from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.ompl.own_planner import OwnPlanner, nearest_pairs
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import bounds_of, to_state
 from apex_ompl.ompl.validity import full_check
@@ -63,16 +62,10 @@ class ImitationPlanner(OwnPlanner):
 
     def _solve(self, ptc: ob.PlannerTerminationCondition) -> Any:
         self.validator = self.validator.current()
-        report, started, dof = self.report, time.perf_counter(), self.validator.checker.robot.dof
-        inputs = self.getPlannerInputStates()
-        starts = read_starts(inputs, dof)
-        if not starts:
-            report.reason = "there is no valid start"
-            return Status.INVALID_START
-        goals = read_goals(inputs, dof, ptc, self.getProblemDefinition().getGoal())
-        if not goals:
-            report.reason = "there is no valid goal"
-            return Status.INVALID_GOAL
+        report, started = self.report, time.perf_counter()
+        starts, goals, status = self._ends(ptc)
+        if status is not None:
+            return status
         reasons: list[str] = []
         for start, goal in nearest_pairs(starts, goals):
             if ptc():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.baselines.control.short_horizon import along
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.moving.compute_costs import ComputeBudget

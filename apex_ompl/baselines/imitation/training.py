@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import math
-import time
-from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from apex_ompl.baselines.imitation.checkpoint import load_policy_network, save_policy
 from apex_ompl.baselines.imitation.config import ImitationConfig
 from apex_ompl.baselines.imitation.data import WindowData, Windows
 from apex_ompl.baselines.imitation.network import PolicyNetwork
-from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import RobotTables
-from apex_ompl.training.run_files import EXPECTED, STATE, RunLog, read_state, write_state
-from apex_ompl.training.training import MAX_SKIPPED, TrainingError
-from apex_ompl.util.files import check_writable, is_file
+from apex_ompl.training.run import RunLog, TrainingRun
 from apex_ompl.util.provenance import commit, hardware
 
 PHASE = "policy"
@@ -31,7 +24,7 @@ CPU = torch.device("cpu")
 ROOT = Path(__file__).resolve().parents[3]
 
 
-class ImitationTrainer:
+class ImitationTrainer(TrainingRun[PolicyNetwork]):
     """Training run of a policy, resumed from the state in its folder where there is one.
 
     The policy is trained by teacher forcing: it is shown states of stored paths, with noise, and not where it would
@@ -40,15 +33,11 @@ class ImitationTrainer:
 
     Attributes:
         config: Configuration of the run.
-        folder: Folder of the run.
         robot: Name of the robot.
         data: Training data.
-        network: Network in training.
-        averaged: Exponential moving average of its weights, by name.
-        step: Number of steps done.
-        seconds: Time of all steps [s].
-        device: Device of torch's that the network is on.
     """
+
+    phase = PHASE
 
     def __init__(self, config: ImitationConfig, folder: Path, device: torch.device = CPU) -> None:
         """Make a network on a device, or load the state of the run in ``folder``, which must exist.
@@ -56,8 +45,8 @@ class ImitationTrainer:
         Raises:
             ApexError: Data, tables or state cannot be read or do not fit.
         """
-        self.config, self.folder, self.device = config, folder, device
-        check_writable(folder / STATE)
+        super().__init__(config, folder, device)
+        self.config = config
         robot = RobotTables.load(config.robot)
         self.robot, self._commit = robot.name, commit(ROOT, ("apex_ompl", "scripts"))
         self.data = WindowData(config, robot)
@@ -67,56 +56,21 @@ class ImitationTrainer:
         self.data.fit(self.network)
         first = "" if config.init is None else self._initialize(config.init)
         self.network.to(device)
-        self.step, self.seconds, self._skipped = 0, 0.0, 0
         determining = f"{config.determining}{robot.name}{self.data.digest()}{first}"
         self._digest = hashlib.sha256(determining.encode()).hexdigest()
-        self._names = [name for name, _ in self.network.named_parameters()]
-        self._parameters = [p for _, p in self.network.named_parameters()]
-        self.averaged = {name: p.detach().clone() for name, p in self.network.named_parameters()}
-        self._optimizer = torch.optim.AdamW(
-            [
-                {"params": [p for p in self._parameters if p.ndim > 1], "weight_decay": config.decay},
-                {"params": [p for p in self._parameters if p.ndim <= 1], "weight_decay": 0.0},
-            ],
-            lr=self._rate(), betas=(0.9, 0.99),
-        )  # fmt: skip
-        if is_file(folder / STATE):
-            self._load_state()
+        self._optimize(self.network.named_parameters())
+        self._load_state()
         self._runlog = RunLog(folder, {PHASE: self.step})
         held_out = self.data.held_out(HELD_OUT_PATHS)
         self._held_out = None if held_out is None else held_out.to(device)
 
     @property
-    def done(self) -> bool:
-        """Whether the training is complete."""
-        return self.step >= self.config.steps
+    def steps(self) -> int:
+        """Number of steps of the training."""
+        return self.config.steps
 
-    def advance(self) -> float:
-        """Do one step of AdamW, and return its loss; a step whose gradient is not finite changes no weight.
-
-        Raises:
-            TrainingError: The gradients of many steps in a row were not finite.
-        """
-        started = time.perf_counter()
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._rate()
-        loss = self.loss(self.network, self.data.batch(self.step).to(self.device))
-        self._optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        norm = nn.utils.clip_grad_norm_(self._parameters, self.config.clip)
-        self.step += 1
-        if torch.isfinite(norm):
-            self._skipped = 0
-            self._optimizer.step()
-            with torch.no_grad():
-                share = 1.0 - min(self.config.ema, (1.0 + self.step) / (10.0 + self.step))
-                torch._foreach_lerp_([self.averaged[name] for name in self._names], list(self._parameters), share)
-        else:
-            self._skipped += 1
-            if self._skipped >= MAX_SKIPPED:
-                raise TrainingError(f"step {self.step}: {MAX_SKIPPED} gradients in a row are not finite")
-        self.seconds += time.perf_counter() - started
-        return float(loss.detach())
+    def _loss(self) -> Tensor:
+        return self.loss(self.network, self.data.batch(self.step).to(self.device))
 
     def loss(self, network: PolicyNetwork, windows: Windows) -> Tensor:
         """Return the mean square error of the predicted next states, in standard deviations of the data."""
@@ -126,38 +80,15 @@ class ImitationTrainer:
         loss: Tensor = (((found - windows.following) / network.scale) ** 2).mean()
         return loss
 
-    def run(self, seconds: float = math.inf, watch: Callable[[ImitationTrainer, float], None] | None = None) -> None:
-        """Train to the end, or for some seconds; log and save at the configured intervals.
-
-        Args:
-            seconds: Time limit [s].
-            watch: Called after each step with this trainer and the loss.
-        """
-        started = saved = time.perf_counter()
-        losses: list[float] = []
-        while not self.done and time.perf_counter() - started < seconds:
-            losses.append(self.advance())
-            if watch is not None:
-                watch(self, losses[-1])
-            if self.step % self.config.log_every == 0 or self.done:
-                row: dict[str, str | int] = {"phase": PHASE, "step": self.step, "loss": f"{np.mean(losses):.6f}"}
-                row |= {"rate": f"{self._rate():.3g}", "seconds": f"{self.seconds:.1f}"}
-                if self._held_out is not None:
-                    row["held_out"] = f"{self._loss_held_out(self.averaged_network()):.6f}"
-                self._runlog.add(row)
-                losses = []
-            if time.perf_counter() - saved > self.config.save_every:
-                self.save()
-                saved = time.perf_counter()
-        self.save()
+    def _log(self, loss: float, last: bool) -> None:
+        row = self._row(loss)
+        if self._held_out is not None:
+            row["held_out"] = f"{self._loss_held_out(self.averaged_network()):.6f}"
+        self._runlog.add(row)
 
     def save(self) -> None:
         """Write the state of the run, and the averaged network as a checkpoint."""
-        state = {
-            "phase": PHASE, "step": self.step, "number": 0, "left": 0, "seconds": self.seconds,
-            "network": self.network.state_dict(), "averaged": self.averaged, "optimizer": self._optimizer.state_dict(),
-        }  # fmt: skip
-        write_state(self.folder, self._digest, state)
+        self._write_state()
         network = self.averaged_network()
         save_policy(self.folder / "checkpoint", network, self.robot, self.data.joints, self.about(network))
 
@@ -213,14 +144,3 @@ class ImitationTrainer:
         same = [name for name, tensor in mine.items() if name in theirs and theirs[name].shape == tensor.shape]
         self.network.load_state_dict({**mine, **{name: theirs[name] for name in same}})
         return about.digest
-
-    def _load_state(self) -> None:
-        state = read_state(self.folder, self._digest, self.device)
-        try:
-            self.network.load_state_dict(state["network"])
-            self.step, self.seconds = state["step"], state["seconds"]
-            averaged = {name: state["averaged"][name] for name in self.averaged}
-            self._optimizer.load_state_dict(state["optimizer"])
-        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
-            raise FileFormatError(str(self.folder / STATE), "", type(error).__name__, EXPECTED) from error
-        self.averaged = averaged

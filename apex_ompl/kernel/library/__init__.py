@@ -21,6 +21,8 @@ from importlib.machinery import ExtensionFileLoader, ModuleSpec
 from pathlib import Path
 from typing import Any
 
+from apex_ompl.kernel.compiled.entry_points import PLANS, RUNS, Group
+
 LOG = logging.getLogger("apex_ompl")
 
 FOLDER = Path(__file__).parent
@@ -115,3 +117,25 @@ def _load() -> Mapping[str, Callable[..., Any]]:
         raise LibraryError(f"this processor is not of level {description['processor']}")
     functions: Mapping[str, Callable[..., Any]] = module.functions
     return functions
+
+
+_ready: set[str] = set()  # groups
+
+
+def compile_for_plans() -> None:
+    """Compile what plans need and neither the library nor the cache has, once in a process."""
+    _compile(PLANS)
+
+
+def compile_for_runs() -> None:
+    """Compile what runs among dynamic obstacles need and neither the library nor the cache has, once in a process."""
+    _compile(RUNS)
+
+
+def _compile(group: Group) -> None:
+    if is_used() or group.what in _ready:
+        return
+    from apex_ompl.kernel.group_compilation import compile_group
+
+    compile_group(group)
+    _ready.add(group.what)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.loop.replan.portfolio import Portfolio
@@ -22,8 +22,8 @@ from apex_ompl.moving.replanner import Answer, Request
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.search import Search, fresh_checker, place, rest_of_route
 from apex_ompl.ompl.process import seed_ompl
+from apex_ompl.ompl.repair import simplify
 from apex_ompl.ompl.setup import PlanningSetup, assemble, set_goals
-from apex_ompl.ompl.simplify import simplify
 from apex_ompl.ompl.space import path_to_array, to_state
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.ompl.validity import MotionValidator

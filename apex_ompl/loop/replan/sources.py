@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from apex_ompl.apex.models import Model, trajectory_model
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import Model, make_query, trajectory_model
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.search import TreePair
 from apex_ompl.model.query import Query

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.apex.models import DEFAULT, has_model
-from apex_ompl.apex.query import make_query
+from apex_ompl.apex.models import DEFAULT, has_model, make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.model.checkpoint import shared_model
