@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.timing import MotionLimits, TimedPath, Timing, Trajectory
 from apex_ompl.timing.duration import DurationOptimizer, direct_durations
 from apex_ompl.timing.parameterization import fitted
+from apex_ompl.timing.ruckig_method import calm as calm_motion
+from apex_ompl.timing.spline_method import whole_nanoseconds
 from apex_ompl.timing.timed_spline import TimedSpline
 from apex_ompl.types import Array
 
@@ -79,85 +81,108 @@ def optimized_motion(
     def stop() -> bool:
         return query.ends() or query.deadline.remaining < reserve
 
-    found = _proved(optimizer, optimizer.fastest(path.states, stop), check, stop)
+    search = _Search(optimizer, timing.method, check, stop)
+    found = search.proved(optimizer.fastest(path.states, stop))
     for goal in _sooner_goals(setup, path, limits, found):
         if stop():
             break
-        other = _proved(optimizer, optimizer.fastest(np.stack([setup.start, goal]), stop), check, stop, repairs=1)
-        if other is not None and (found is None or other[0].duration < found[0].duration):
+        other = search.proved(optimizer.fastest(np.stack([setup.start, goal]), stop), repairs=1)
+        if other is not None and (found is None or other.spline.duration < found.spline.duration):
             found = other
     if found is not None:
-        factor = query.calm_factor if query.objective == "calm" else 1.0
-        duration = max(factor * found[0].duration, timing.minimum_duration)
-        if duration > found[0].duration:
-            calm = query.objective == "calm" and not stop()
-            spline = found[0].lasting(duration / found[0].spans)
-            same = _proved(optimizer, spline, check, stop, repairs=0)
-            made = _proved(optimizer, optimizer.calmest(spline, duration), check, stop, repairs=0) if calm else None
-            found = made or same
-    kept = None if found is None else _kept(found[1], found[2], limits, timing, check, more=more)
-    return None if kept is None else _with_path(setup, timing, *kept)
+        calm = query.objective == "calm"
+        found = search.lasting(
+            found, max((query.calm_factor if calm else 1.0) * found.spline.duration, timing.minimum_duration), calm
+        )
+    timed = None if found is None else _kept(found, limits, timing, check, more)
+    return None if timed is None else _with_path(setup, *timed)
+
+
+class _Proved(NamedTuple):
+    """A motion that passed the full check."""
+
+    spline: TimedSpline
+    timed: TimedPath
+    proof: PathProof
+
+
+class _Search(NamedTuple):
+    """Proves motions, and repairs those that are not."""
+
+    optimizer: DurationOptimizer
+    method: str
+    check: Check
+    stop: Callable[[], bool]
+
+    def proved(self, spline: TimedSpline | None, repairs: int = REPAIRS) -> _Proved | None:
+        """Return a motion that passed the full check, or None."""
+        for turn in range(1, repairs + 2):
+            timed = None if spline is None or self.stop() else self._timed(spline)
+            if spline is None or timed is None:
+                return None
+            checked = self.check(timed.trajectory)
+            if checked and checked.proof is not None:
+                return _Proved(spline, timed, checked.proof)
+            if turn <= repairs:
+                spline = self.optimizer.cleared(spline, turn)
+        return None
+
+    def lasting(self, found: _Proved, duration: float, calm: bool) -> _Proved | None:
+        """Return a motion of a longer duration [s]: a calm one if asked and proved, else along the same curve."""
+        if duration <= found.spline.duration:
+            return found
+        slower = found.spline.lasting(whole_nanoseconds(duration / found.spline.spans))
+        made = self.proved(self.optimizer.calmest(slower), repairs=0) if calm and not self.stop() else None
+        return made or self.proved(slower, repairs=0)
+
+    def _timed(self, spline: TimedSpline) -> TimedPath | None:
+        """Return the motion of a spline by the method."""
+        motion = spline.trajectory(self.optimizer.kernel.robot.joint_names)
+        if self.method != "ruckig":
+            return TimedPath(motion, 0.0, self.method, OPTIMIZED)
+        made = calm_motion(motion, self.optimizer.limits, self.stop)
+        return None if made is None else TimedPath(made.trajectory, 0.0, made.method, OPTIMIZED)
 
 
 def _kept(
-    motion: Trajectory, proof: PathProof, limits: Limits, timing: Timing, check: Check, *, more: MotionLimits | None
-) -> tuple[Trajectory, PathProof] | None:
+    found: _Proved, limits: Limits, timing: Timing, check: Check, more: MotionLimits | None
+) -> tuple[TimedPath, PathProof] | None:
     """Return the motion within limits of torques and tool speeds, and its certificate, or None where none is proved."""
+    motion = found.timed.trajectory
     if more is None or more.stretch(motion) == 1.0:
-        return motion, proof
+        return found.timed, found.proof
     try:
-        faster = fitted(motion, limits, more, replace(timing, deviation=min(timing.deviation, FITTED))).trajectory
+        faster = fitted(motion, limits, more, replace(timing, deviation=min(timing.deviation, FITTED)))
     except TimingError:  # gravity overloads it
         return None
-    for candidate in (faster, motion.slower(more.stretch(motion))):
-        checked = check(candidate)
+    slower = replace(found.timed, trajectory=motion.slower(more.stretch(motion)).merged())
+    for candidate in (faster, slower):
+        checked = check(candidate.trajectory)
         if checked and checked.proof is not None:
-            return candidate, checked.proof
+            return replace(candidate, deviation=0.0), checked.proof
     return None
 
 
-Proved = tuple[TimedSpline, Trajectory, PathProof]
-
-
-def _proved(
-    optimizer: DurationOptimizer, spline: TimedSpline | None, check: Check, stop: Callable[[], bool],
-    repairs: int = REPAIRS,
-) -> Proved | None:  # fmt: skip
-    """Return a motion that passed the full check, or None."""
-    names = optimizer.kernel.robot.joint_names
-    for turn in range(1, repairs + 2):
-        if spline is None or stop():
-            return None
-        motion = spline.trajectory(names)
-        checked = check(motion)
-        if checked and checked.proof is not None:
-            return spline, motion, checked.proof
-        if turn <= repairs:
-            spline = optimizer.cleared(spline, turn)
-    return None
-
-
-def _sooner_goals(setup: PlanningSetup, path: Path, limits: Limits, found: Proved | None) -> Iterator[Array]:
+def _sooner_goals(setup: PlanningSetup, path: Path, limits: Limits, found: _Proved | None) -> Iterator[Array]:
     """Yield other goals that could be reached sooner, the nearest in time first."""
     goals = setup.valid_goals
     if len(goals) < 2:
         return
     durations = direct_durations(setup.start, goals, limits)
-    most = np.inf if found is None else SOONER * found[0].duration
+    most = np.inf if found is None else SOONER * found.spline.duration
     for k in np.argsort(durations, kind="stable")[:GOALS]:
         if durations[k] < most and not np.array_equal(goals[k], path.states[-1]):
             yield goals[k]
 
 
-def _with_path(setup: PlanningSetup, timing: Timing, motion: Trajectory, proof: PathProof) -> ProvedMotion | None:
+def _with_path(setup: PlanningSetup, timed: TimedPath, proof: PathProof) -> ProvedMotion | None:
     """Return a motion with the path through its own states, or None where none passes the full check."""
+    motion = timed.trajectory
     for count in STATES_PER_KNOT:
-        times = np.linspace(0.0, motion.duration, count * (len(motion.times) - 1) + 1)
-        states = motion(times)
+        states = motion(np.linspace(0.0, motion.duration, count * (len(motion.times) - 1) + 1))
         states = states.clip(motion.positions.min(axis=0), motion.positions.max(axis=0))  # joints that stay do
         states[0], states[-1] = motion.positions[0], motion.positions[-1]
         checked = full_check(setup.checker, states, setup.start, setup.goals)
         if checked and checked.proof is not None:
-            timed = TimedPath(motion, 0.0, timing.method, OPTIMIZED)
             return ProvedMotion(timed, Path(states), proof, checked.proof)
     return None

@@ -38,7 +38,6 @@ GUESS_STATES = 257  # of a path
 MARGIN = 0.005  # least clearance at the samples [m]
 CLOSER = 1.05, 0.004  # samples a round of repair adds to the last ones, as a factor, and margin [m]
 MOST_SPANS = 400
-ROUNDING = 1e-9  # share of the knot spacing that keeps rounding within the limits
 PROX = 1e-3
 LARGEST = 0.25  # change of a control point in a step [rad]
 DECREASE = 0.3
@@ -143,9 +142,8 @@ class DurationOptimizer:
         better, _ = self._lowered(spline, REPAIR, samples=REPAIR.samples * times, margin=CLOSER[1] * times)
         return better
 
-    def calmest(self, spline: TimedSpline, duration: float) -> TimedSpline:
-        """Return a motion of a duration [s], longer than that of ``spline``, with a small integral of squared jerk."""
-        spline = spline.lasting(duration / spline.spans)
+    def calmest(self, spline: TimedSpline) -> TimedSpline:
+        """Return a motion in the time of another one, inside the limits, with a small integral of the squared jerk."""
         shares = np.diff(spline.control, PINNED, axis=0)[:, ~self._held] / self.limits.jerk[~self._held]
         total = float((shares**2).sum()) / spline.spacing ** (2 * PINNED)
         if not total:
@@ -190,7 +188,7 @@ class DurationOptimizer:
         grid = _grid(len(control), samples or level.samples)
         report = lower_duration(self.kernel, grid, self._limits, PINNED, control, spacing, settings)
         least = least_knot_spacing(control, self.limits)
-        final = max(report.spacing, least) if calm else least * (1.0 + ROUNDING)
+        final = max(spacing, least) if calm else least
         return TimedSpline(control, final, spline.start), report
 
 

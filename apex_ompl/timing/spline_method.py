@@ -138,7 +138,12 @@ def least_knot_spacing(control: Array, limits: Limits) -> float:
     for order, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1):
         difference = np.diff(difference, axis=0)
         least.append(float(np.abs(difference / limit).max(initial=0.0)) ** (1.0 / order))
-    return NANOSECOND * float(math.ceil(max(least) * (1.0 + 1e-9) / NANOSECOND))
+    return whole_nanoseconds(max(least) * (1.0 + 1e-9))
+
+
+def whole_nanoseconds(time: float) -> float:
+    """Return a time rounded up to whole nanoseconds, the resolution of messages [s]."""
+    return NANOSECOND * float(math.ceil(time / NANOSECOND))
 
 
 def spline_in_time(
