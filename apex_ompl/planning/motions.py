@@ -17,8 +17,9 @@ from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import FullCheck, MotionValidator, StateValidityChecker, full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.robot.model import Limits
+from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing import TimedPath, Timing, Trajectory
-from apex_ompl.timing.duration import DurationOptimizer, direct_durations
+from apex_ompl.timing.duration import DurationOptimizer
 from apex_ompl.timing.timed_spline import TimedSpline
 from apex_ompl.types import Array
 

@@ -45,6 +45,7 @@ from apex_ompl.planning.query import Group, planned_joints
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
+from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.duration import CALM_FACTOR, DEFAULT_OBJECTIVE, check_objective
@@ -288,7 +289,7 @@ def straight_line(query: PlanQuery) -> FoundPath | None:
     """
     setup = query.setup
     with timed(query.times, "line"):
-        for goal in sorted(setup.valid_goals, key=lambda goal: float(np.linalg.norm(goal - setup.start))):
+        for goal in _nearest_first(query):
             if query.deadline.expired:
                 return _out_of_time(query)
             line = np.stack([setup.start, goal])
@@ -302,6 +303,14 @@ def straight_line(query: PlanQuery) -> FoundPath | None:
                 return FoundPath(query, PlanStatus.TIMEOUT, NOT_PROVED)
             query.rejected_lines.append(line)
     return None
+
+
+def _nearest_first(query: PlanQuery) -> Array:
+    """Return the valid goals, the nearest first, by the objective: in length, or in time; shape (goals, dof)."""
+    setup, goals = query.setup, query.setup.valid_goals
+    if query.objective == "length":
+        return goals[np.argsort(np.linalg.norm(goals - setup.start, axis=1), kind="stable")]
+    return goals[np.argsort(direct_durations(setup.start, goals, setup.robot.limits), kind="stable")]
 
 
 def prove(found: FoundPath, simplify: bool = True) -> ProvedPath:

@@ -193,30 +193,6 @@ class DurationOptimizer:
         return TimedSpline(control, final, spline.start), report
 
 
-def direct_durations(start: Array, goals: Array, limits: Limits) -> Array:
-    """Return the least durations of motions from rest to rest, obstacles ignored, shape (N,) [s].
-
-    Every joint takes its fastest profile of constant jerks for the distance d: with the ramp a/j of the acceleration
-    T = d/v + v/a + a/j where the largest velocity v is reached, else T = a/j + sqrt((a/j)^2 + 4 d/a) where the largest
-    acceleration a is, else T = (32 d/j)^(1/3); where v < a^2/j, v is reached without a: T = d/v + 2 sqrt(v/j).
-
-    Args:
-        start: Start state, shape (dof,).
-        goals: Goal states, shape (N, dof).
-        limits: Limits of the joints.
-    """
-    d, (v, a, j) = np.abs(goals - start), (limits.velocity, limits.acceleration, limits.jerk)
-    ramp = a / j
-    short = v < a * ramp  # the largest velocity is reached before the largest acceleration
-    reach = np.where(short, 2.0 * v * np.sqrt(v / j), v * (v / a + ramp))  # distance from which v is reached
-    full = np.where(short, d / v + 2.0 * np.sqrt(v / j), d / v + v / a + ramp)
-    ramped = ramp + np.sqrt(ramp**2 + 4.0 * d / a)
-    jerky = np.cbrt(32.0 * d / j)
-    between = np.where(d >= 2.0 * a * ramp**2, ramped, jerky)
-    durations: Array = np.where(d >= reach, full, np.where(short, jerky, between)).max(axis=1)
-    return durations
-
-
 def _ramped(share: Array) -> Array:
     """Return the share of the way after a share of the time, with ramps of speed at both ends."""
     speed = 1.0 / (1.0 - RAMP)
