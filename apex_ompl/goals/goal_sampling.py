@@ -41,6 +41,7 @@ CHILDREN = 16  # states of a round of random search
 ROUNDS, MOST_ROUNDS = 8, 24  # of random search: at first, and while a much nearer state is known that is not free
 MUCH_NEARER = 1.1  # ratio of the durations
 SPREADS = 0.02, 0.3  # least and largest standard deviation of perturbations, as a share of the joints' reach
+NEARLY = 1.5  # ratio of durations up to which a state is nearly as near
 PULL = 0.3  # largest share of the way to the start
 
 
@@ -127,7 +128,7 @@ def sample(
         else:
             found = others = np.concatenate([others, search.cleared(reached)])
         near = search.free(found, min(count, NEAREST), NEAR)
-    near = search.improved(near)
+    near = search.improved(near, np.concatenate([near, found, others]))
     states = np.concatenate([near, search.free(others, count - len(near), APART, near)])
     blocked = ""
     if search.colliding is not None and not len(states):
@@ -150,6 +151,7 @@ class _Search:
         self._reached = min(REACHED, *(bound / 2.0 for bound in goal.bounds.values() if bound))
         self._least = np.inf  # duration to a state that reaches the goal, free or not
         self._known: dict[bytes, bool] = {}  # whether a state is free
+        self._straight: dict[bytes, bool] = {}  # whether the line to a state is
         self._blocked = np.empty((0, len(self.start)))
 
     def durations(self, states: Array) -> Array:
@@ -212,7 +214,9 @@ class _Search:
             states = self._children(best, 0.0, direct_reach(float(self.durations(best).min()), self.limits))
         return best
 
-    def free(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
+    def free(
+        self, states: Array, count: int, apart: float, taken: Array | None = None, straight: bool = False,
+    ) -> Array:  # fmt: skip
         """Return the nearest free states, up to a number of them, that are apart from each other.
 
         Args:
@@ -220,6 +224,7 @@ class _Search:
             count: Their largest number.
             apart: Least distance, of the joint that moves most.
             taken: States from which they are to be apart, too, shape (M, dof).
+            straight: Whether a quick test is to find no collision on the straight line from the start, either.
         """
         durations = self.durations(states)
         self._least = min(self._least, *durations, np.inf)
@@ -228,24 +233,46 @@ class _Search:
         for q in states[np.argsort(durations, kind="stable")]:
             if len(found) - first >= count:
                 break
-            if not (np.abs(found - q).max(axis=1) < apart).any() and self._is_free(q):
+            if (np.abs(found - q).max(axis=1) < apart).any() or not self._is_free(q):
+                continue
+            if not straight or self._is_straight(q):
                 found = np.concatenate([found, q[None]])
         return found[first:]
 
-    def improved(self, states: Array) -> Array:
-        """Return states made nearer by random search, those that are nearest, shape (N, dof)."""
-        if not len(states):
-            return states
-        best, turn = states, 0
+    def improved(self, near: Array, known: Array) -> Array:
+        """Return free states that are nearer, by random search, and the nearest ones before it, shape (N, dof).
+
+        Where straight lines from the start to states that are nearly as near are free, the search keeps to such states.
+
+        Args:
+            near: The nearest free states, shape (N, dof).
+            known: States that reach the goal, shape (M, dof).
+        """
+        if not len(near):
+            return near
+        enough = NEARLY * float(self.durations(near).min())
+        best = self.free(known[self.durations(known) <= enough], 1, NEAR, straight=True)
+        straight = len(best) > 0
+        if not straight:
+            best = near
+        turn = 0
         while turn < MOST_ROUNDS:
             nearest = float(self.durations(best[:1])[0])
             if turn >= ROUNDS and nearest <= MUCH_NEARER * self._least:
                 break
             turn += 1
             children = self._children(best, PULL, direct_reach(nearest, self.limits))
-            nearer = self.durations(children) < self.durations(best).max()
-            best = self.free(np.concatenate([best, children[nearer]]), NEAREST, 0.0)
-        return self.free(np.concatenate([best, states]), len(states), NEAR)
+            nearer = children[self.durations(children) < self.durations(best).max()]
+            best = self.free(np.concatenate([best, nearer]), NEAREST, 0.0, straight=straight)
+        best = self.free(best, 1, NEAR)
+        return np.concatenate([best, self.free(near, NEAREST - 1, NEAR, best)])
+
+    def _is_straight(self, q: Array) -> bool:
+        """Whether a quick test finds no collision on the straight line from the start to a state."""
+        key = q.tobytes()
+        if key not in self._straight:
+            self._straight[key] = not self.checker.collides_along(np.stack([self.start, q]))
+        return self._straight[key]
 
     def _children(self, parents: Array, pull: float, reach: Array) -> Array:
         """Return states of the goal around others, shape (N, dof), up to a share ``pull`` of the way to the start."""
