@@ -134,9 +134,8 @@ def _with_path(
     for count in STATES_PER_KNOT:
         times = np.linspace(0.0, motion.duration, count * (len(motion.times) - 1) + 1)
         states = motion(times)
+        states = states.clip(motion.positions.min(axis=0), motion.positions.max(axis=0))  # joints that stay do
         states[0], states[-1] = motion.positions[0], motion.positions[-1]
-        limits = setup.robot.limits
-        states = states.clip(limits.lower, limits.upper)
         checked = full_check(setup.checker, states, setup.start, setup.goals)
         if checked and checked.proof is not None:
             timed = TimedPath(motion, 0.0, timing.method, OPTIMIZED)

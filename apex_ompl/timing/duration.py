@@ -181,6 +181,7 @@ class DurationOptimizer:
         """Return a spline after the steps of a level, in its least duration or with ``calm`` in its own."""
         control = np.array(spline.control, order="C")
         control[PINNED:-PINNED] = control[PINNED:-PINNED].clip(self.limits.lower, self.limits.upper)
+        control[:, self._held] = control[0, self._held]
         spacing = max(spline.spacing if calm else 0.0, level.slack * least_knot_spacing(control, self.limits))
         settings = DurationSettings(
             self.margin + margin, level.horizon + margin, PROX, level.mean, DECREASE, LARGEST, level.tolerance,

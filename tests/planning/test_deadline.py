@@ -61,7 +61,7 @@ def ready() -> PlanningSetup:
 
 @pytest.fixture(scope="module")
 def found() -> PlanResult:
-    result = plan(PROBLEM, "rrtconnect", timeout=20.0, seed=3, simplify=False)
+    result = plan(PROBLEM, "rrtconnect", timeout=20.0, seed=3, simplify=False, objective="length")
     assert result and result.path is not None and len(result.path) > 2
     return result
 

@@ -68,10 +68,10 @@ def test_faulty_paths_and_parameters_are_named() -> None:
 
 
 def test_the_spline_of_the_planner_comes_out_of_plan_and_out_of_files(tmp_path: pathlib.Path) -> None:
-    result = plan(cached_problem(HARD), timeout=20.0, timing=Timing(method="spline"))
+    result = plan(cached_problem(HARD), timeout=20.0, timing=Timing(method="spline"), objective="length")
     assert result and result.path is not None and result.path.spline is not None
     np.testing.assert_array_equal(result.path.spline.path(result.path.control), result.path.states)
-    tree = plan(cached_problem(HARD), "rrtconnect", timeout=20.0)
+    tree = plan(cached_problem(HARD), "rrtconnect", timeout=20.0, objective="length")
     assert tree and tree.path is not None and tree.path.spline is None
     for one in (result, tree):
         for suffix in (".npz", ".json", ".yaml"):

@@ -450,7 +450,7 @@ def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> Non
         (ApexError, "more than one pose is given for 'left_hand'", lambda: planner.plan(home, [hand, hand])),
         (
             UnknownNameError,
-            "unknown option 'timout', did you mean 'timeout'. known: group, leave_contact, params, ",
+            "unknown option 'timout', did you mean 'timeout'. known: calm_factor, group, leave_contact, objective, ",
             lambda: planner.plan(home, home, timout=3.0),
         ),
         (UnknownNameError, "unknown option 'started'; known", lambda: planner.plan_problem(hard, started=3.0)),

@@ -39,7 +39,7 @@ def test_the_steps_give_what_a_plan_gives() -> None:
 def test_two_planners_on_one_setup() -> None:
     setup = assemble(cached_problem(PROBLEM), seed=3)
     for name in ("rrtconnect", "apex", "rrtconnect+polish"):
-        result = time(prove(solve(check(setup, name, timeout=20.0))))
+        result = time(prove(solve(check(setup, name, timeout=20.0, objective="length"))))
         assert result and result.planner == name and (result.path.spline is None) == (name == "rrtconnect")  # type: ignore[union-attr]
 
 
@@ -65,7 +65,7 @@ def test_planners_are_given_by_name_parameters_or_function() -> None:
     for given, name in ((tuned, "rrtconnect"), (tuned.build, "rrtconnect"), (og.RRTConnect, "RRTConnect")):
         result = plan(PROBLEM, given, timeout=20.0)
         assert result and result.planner == name
-    smooth = plan(PROBLEM, lambda si: APEX(si, seed=1), timeout=20.0)
+    smooth = plan(PROBLEM, lambda si: APEX(si, seed=1), timeout=20.0, objective="length")
     assert smooth and smooth.planner == "apex" and smooth.path is not None and smooth.path.spline is not None
     with pytest.raises(UnknownNameError, match="range"):
         plan(PROBLEM, og.RRTConnect, params={"range": 1.0})

@@ -60,7 +60,7 @@ def test_a_path_that_cannot_be_timed_is_no_success(monkeypatch: pytest.MonkeyPat
         raise TimingError("the motion collides")
 
     monkeypatch.setattr(steps, "time_path", fails)
-    result = plan("ball_in_cup", timeout=20.0)
+    result = plan("ball_in_cup", timeout=20.0, objective="length")
     assert result.status is PlanStatus.TIMING_FAILED and not result and result.path is not None
     assert result.reason == "the path cannot be timed, the motion collides" and result.trajectory is None
     assert plan("ball_in_cup", timeout=20.0, timing=False)

@@ -280,10 +280,12 @@ def _add_limits(
 
 @reassociating_inlined
 def _add_bounds(t: RobotArrays, p: Problem, control: Floats, mu: float, b: Buffers) -> None:
-    """Add the position limits of the free control points."""
+    """Add the position limits of the free control points; joints that stay get none, and no step."""
     dof = control.shape[1]
     for j in range(len(b.gradient)):
         d = j % dof
+        if not p.limits[0, d] > 0.0:
+            continue
         q = control[p.pinned + j // dof, d]
         upper = 1.0 / max(t.upper[d] - q, LEAST_BOUND_SLACK)
         lower = 1.0 / max(q - t.lower[d], LEAST_BOUND_SLACK)
