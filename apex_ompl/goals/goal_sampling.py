@@ -255,12 +255,10 @@ class _Search:
         straight = len(best) > 0
         if not straight:
             best = near
-        turn = 0
-        while turn < MOST_ROUNDS:
+        for turn in range(ROUNDS if straight else MOST_ROUNDS):
             nearest = float(self.durations(best[:1])[0])
             if turn >= ROUNDS and nearest <= MUCH_NEARER * self._least:
                 break
-            turn += 1
             children = self._children(best, PULL, direct_reach(nearest, self.limits))
             nearer = children[self.durations(children) < self.durations(best).max()]
             best = self.free(np.concatenate([best, nearer]), NEAREST, 0.0, straight=straight)

@@ -6,7 +6,7 @@ could be reached sooner are tried, too.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 OPTIMIZED = "optimized"  # form of a motion that is not along a path
 REPAIRS = 3  # of a motion that is not proved
-GOALS = 3  # other goals to which a straight motion is tried
+GOALS = 4  # other goals to which a straight motion is tried
 SOONER = 0.95  # share of the duration that the lower bound of another goal must not reach
 STATES_PER_KNOT = 2, 4, 8  # of the path along a motion; the first that passes the full check
 SHARE = 0.5  # of the time left
@@ -75,10 +75,12 @@ def optimized_motion(query: PlanQuery, path: Path, timing: Timing, check: Check)
         return query.ends() or query.deadline.remaining < reserve
 
     found = _proved(optimizer, optimizer.fastest(path.states, stop), check, stop)
-    for goal in _sooner_goals(setup, path, limits, found):
-        if stop():
+    for goal, least in _other_goals(setup, path, limits):
+        most = np.inf if found is None else SOONER * found[0].duration
+        if stop() or least >= most:
             break
-        other = _proved(optimizer, optimizer.fastest(np.stack([setup.start, goal]), stop), check, stop, repairs=1)
+        straight = optimizer.fastest(np.stack([setup.start, goal]), stop, most)
+        other = _proved(optimizer, straight, check, stop, repairs=1)
         if other is not None and (found is None or other[0].duration < found[0].duration):
             found = other
     if found is not None:
@@ -114,16 +116,12 @@ def _proved(
     return None
 
 
-def _sooner_goals(setup: PlanningSetup, path: Path, limits: Limits, found: Proved | None) -> Iterator[Array]:
-    """Yield other goals that could be reached sooner, the nearest in time first."""
+def _other_goals(setup: PlanningSetup, path: Path, limits: Limits) -> list[tuple[Array, float]]:
+    """Return the nearest goals at which the path does not end, with the least durations to them [s]."""
     goals = setup.valid_goals
-    if len(goals) < 2:
-        return
+    goals = goals[(goals != path.states[-1]).any(axis=1)]
     durations = direct_durations(setup.start, goals, limits)
-    most = np.inf if found is None else SOONER * found[0].duration
-    for k in np.argsort(durations, kind="stable")[:GOALS]:
-        if durations[k] < most and not np.array_equal(goals[k], path.states[-1]):
-            yield goals[k]
+    return [(goals[k], float(durations[k])) for k in np.argsort(durations, kind="stable")[:GOALS]]
 
 
 def _with_path(

@@ -38,6 +38,9 @@ GUESS_STATES = 257  # of a path
 MARGIN = 0.005  # least clearance at the samples [m]
 CLOSER = 1.05, 0.004  # samples a round of repair adds to the last ones, as a factor, and margin [m]
 MOST_SPANS = 400
+FEW_STATES = 33  # of a path, for its clearance
+DEEP, STUCK = -0.02, 0.8  # clearance of a motion with little hope [m], and least ratio to the one before a round
+SLOWER = 1.15  # ratio of its duration to the one that it is to undercut
 ROUNDING = 1e-9  # share of the knot spacing that keeps rounding within the limits
 PROX = 1e-3
 LARGEST = 0.25  # change of a control point in a step [rad]
@@ -109,28 +112,37 @@ class DurationOptimizer:
         self._limits = np.stack([limits.velocity, limits.acceleration, limits.jerk])
         self._limits[:, self._held] = 0.0
 
-    def fastest(self, states: Array, stop: Callable[[], bool] = lambda: False) -> TimedSpline | None:
+    def fastest(
+        self, states: Array, stop: Callable[[], bool] = lambda: False, most: float = np.inf
+    ) -> TimedSpline | None:  # fmt: skip
         """Return a locally fastest motion near a path.
 
         Args:
             states: The path, shape (N, dof).
             stop: Called between rounds; True ends the optimization.
+            most: Duration that the motion is to undercut [s]; where a round leaves little hope, the rest are left out.
 
         Returns:
-            The motion from the first state to the last, or None where these are one, the path cannot be cleared, or
-            ``stop`` returned True.
+            The motion from the first state to the last, or None where these are one, the path cannot be cleared,
+            ``stop`` returned True, or little hope is left.
 
         Raises:
             ParameterError: The path has another shape.
         """
         check_states(states, self.kernel.robot.dof, "path", least=1)
         spline = self._guess(states)
+        to_undercut = np.isfinite(most)
+        clearance = float(self.kernel.clearance(resample(states, FEW_STATES)).min()) if to_undercut else 0.0
         for level in LEVELS:
             if spline is None or stop():
                 return None
             if level is not LEVELS[0]:
                 spline = self._refitted(spline, level)
-            spline, _ = self._lowered(spline, level)
+            spline, report = self._lowered(spline, level)
+            stuck = report.clearance < min(DEEP, STUCK * clearance)
+            if to_undercut and (stuck or spline.duration > SLOWER * most):
+                return None
+            clearance = report.clearance
         return spline
 
     def cleared(self, spline: TimedSpline, times: int = 1) -> TimedSpline:
