@@ -38,10 +38,11 @@ SAME = 0.02  # distance up to which states collide where one does [rad]
 MARGIN = 0.05  # clearance that is enough [m]
 CLEARING_ROUNDS = 12  # of random search for a free state
 CHILDREN = 16  # states of a round of random search
-ROUNDS, MOST_ROUNDS = 8, 24  # of random search: at first, and while a much nearer state is known that is not free
+ROUNDS, MOST_ROUNDS = 8, 16  # of random search: at first, and while a much nearer state is known that is not free
 MUCH_NEARER = 1.1  # ratio of the durations
 SPREADS = 0.02, 0.3  # least and largest standard deviation of perturbations, as a share of the joints' reach
-NEARLY = 1.5  # ratio of durations up to which a state is nearly as near
+ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares of it
+DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
 PULL = 0.3  # largest share of the way to the start
 
 
@@ -123,13 +124,13 @@ def sample(
         reached = search.reached(ends)
         converged += len(reached)
         others = np.concatenate([others, reached])
-        if len(search.free(others, 1, APART)):
+        if len(search.nearest(others, 1, APART)):
             found = np.concatenate([near, reached, *search.approached(reached)])
         else:
             found = others = np.concatenate([others, search.cleared(reached)])
-        near = search.free(found, min(count, NEAREST), NEAR)
+        near = search.nearest(found, min(count, NEAREST), NEAR)
     near = search.improved(near, np.concatenate([near, found, others]))
-    states = np.concatenate([near, search.free(others, count - len(near), APART, near)])
+    states = np.concatenate([near, search.nearest(others, count - len(near), APART, near)])
     blocked = ""
     if search.colliding is not None and not len(states):
         blocked = str(next(iter(checker.contacts(search.colliding)), "in collision"))
@@ -151,7 +152,6 @@ class _Search:
         self._reached = min(REACHED, *(bound / 2.0 for bound in goal.bounds.values() if bound))
         self._least = np.inf  # duration to a state that reaches the goal, free or not
         self._known: dict[bytes, bool] = {}  # whether a state is free
-        self._straight: dict[bytes, bool] = {}  # whether the line to a state is
         self._blocked = np.empty((0, len(self.start)))
 
     def durations(self, states: Array) -> Array:
@@ -214,35 +214,43 @@ class _Search:
             states = self._children(best, 0.0, direct_reach(float(self.durations(best).min()), self.limits))
         return best
 
-    def free(
-        self, states: Array, count: int, apart: float, taken: Array | None = None, straight: bool = False,
-    ) -> Array:  # fmt: skip
-        """Return the nearest free states, up to a number of them, that are apart from each other.
+    def free(self, states: Array, costs: Array, count: int, apart: float, taken: Array | None = None) -> Array:
+        """Return the free states of least cost, up to a number of them, that are apart from each other.
 
         Args:
             states: States that reach the goal, shape (N, dof).
+            costs: Their costs, shape (N,).
             count: Their largest number.
             apart: Least distance, of the joint that moves most.
             taken: States from which they are to be apart, too, shape (M, dof).
-            straight: Whether a quick test is to find no collision on the straight line from the start, either.
         """
-        durations = self.durations(states)
-        self._least = min(self._least, *durations, np.inf)
         found = np.empty((0, states.shape[1])) if taken is None else taken
         first = len(found)
-        for q in states[np.argsort(durations, kind="stable")]:
+        for q in states[np.argsort(costs, kind="stable")]:
             if len(found) - first >= count:
                 break
-            if (np.abs(found - q).max(axis=1) < apart).any() or not self._is_free(q):
-                continue
-            if not straight or self._is_straight(q):
+            if not (np.abs(found - q).max(axis=1) < apart).any() and self._is_free(q):
                 found = np.concatenate([found, q[None]])
         return found[first:]
 
-    def improved(self, near: Array, known: Array) -> Array:
-        """Return free states that are nearer, by random search, and the nearest ones before it, shape (N, dof).
+    def nearest(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
+        """Return the free states that are nearest in time, see :meth:`free`."""
+        durations = self.durations(states)
+        self._least = min(self._least, *durations, np.inf)
+        return self.free(states, durations, count, apart, taken)
 
-        Where straight lines from the start to states that are nearly as near are free, the search keeps to such states.
+    def costs(self, states: Array) -> Array:
+        """Return the durations to states, more by a share where the straight lines to them collide, shape (N,) [s]."""
+        ends = self.checker.kernel.clearance(np.concatenate([self.start[None], states]), 0.0)
+        lines = self.start + ALONG[:, None, None] * (states - self.start)
+        clearances = self.checker.kernel.clearance(lines.reshape(-1, states.shape[1]), 0.0)
+        least = np.minimum(ends[0], ends[1:])
+        depths = np.maximum(least - clearances.reshape(len(ALONG), len(states), 2), 0.0).sum(axis=2).mean(axis=0)
+        costs: Array = self.durations(states) * (1.0 + DETOUR * depths / (depths + DEPTH))
+        return costs
+
+    def improved(self, near: Array, known: Array) -> Array:
+        """Return free states of lower cost by random search, the least one first, and nearest ones, shape (N, dof).
 
         Args:
             near: The nearest free states, shape (N, dof).
@@ -250,27 +258,24 @@ class _Search:
         """
         if not len(near):
             return near
-        enough = NEARLY * float(self.durations(near).min())
-        best = self.free(known[self.durations(known) <= enough], 1, NEAR, straight=True)
-        straight = len(best) > 0
-        if not straight:
-            best = near
-        for turn in range(ROUNDS if straight else MOST_ROUNDS):
-            nearest = float(self.durations(best[:1])[0])
-            if turn >= ROUNDS and nearest <= MUCH_NEARER * self._least:
+        durations = self.durations(known)
+        order = np.argsort(durations, kind="stable")[:CHILDREN]
+        best = np.concatenate([near, known[order]])
+        best = self.free(best, self.costs(best), NEAREST, NEAR)
+        costs = self.costs(best)
+        for turn in range(MOST_ROUNDS):
+            duration = float(self.durations(best[:1])[0])
+            if turn >= ROUNDS and duration <= MUCH_NEARER * self._least:
                 break
-            children = self._children(best, PULL, direct_reach(nearest, self.limits))
-            nearer = children[self.durations(children) < self.durations(best).max()]
-            best = self.free(np.concatenate([best, nearer]), NEAREST, 0.0, straight=straight)
-        best = self.free(best, 1, NEAR)
-        return np.concatenate([best, self.free(near, NEAREST - 1, NEAR, best)])
-
-    def _is_straight(self, q: Array) -> bool:
-        """Whether a quick test finds no collision on the straight line from the start to a state."""
-        key = q.tobytes()
-        if key not in self._straight:
-            self._straight[key] = not self.checker.collides_along(np.stack([self.start, q]))
-        return self._straight[key]
+            children = self._children(best, PULL, direct_reach(duration, self.limits))
+            children = children[self.durations(children) < costs.max()]
+            if len(children):
+                both, all_costs = np.concatenate([best, children]), np.concatenate([costs, self.costs(children)])
+                better = all_costs <= costs.max()
+                best = self.free(both[better], all_costs[better], NEAREST, 0.0)
+                costs = self.costs(best)
+        best = best[:1]
+        return np.concatenate([best, self.nearest(np.concatenate([near, best]), NEAREST - 1, NEAR, best)])
 
     def _children(self, parents: Array, pull: float, reach: Array) -> Array:
         """Return states of the goal around others, shape (N, dof), up to a share ``pull`` of the way to the start."""
