@@ -38,8 +38,8 @@ SAME = 0.02  # distance up to which states collide where one does [rad]
 MARGIN = 0.05  # clearance that is enough [m]
 CLEARING_ROUNDS = 12  # of random search for a free state
 CHILDREN = 16  # states of a round of random search
-ROUNDS, MOST_ROUNDS = 8, 16  # of random search: at first, and while a much nearer state is known that is not free
-MUCH_NEARER = 1.1  # ratio of the durations
+MOST_ROUNDS = 20  # of random search
+LOWER, PATIENCE = 0.99, 4  # ratio of costs, and rounds after which it ends without one lower by it
 SPREADS = 0.02, 0.3  # least and largest standard deviation of perturbations, as a share of the joints' reach
 ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares of it
 DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
@@ -150,7 +150,6 @@ class _Search:
         self.start = goal.start.clip(self.limits.lower, self.limits.upper)
         self.colliding: Array | None = None
         self._reached = min(REACHED, *(bound / 2.0 for bound in goal.bounds.values() if bound))
-        self._least = np.inf  # duration to a state that reaches the goal, free or not
         self._known: dict[bytes, bool] = {}  # whether a state is free
         self._blocked = np.empty((0, len(self.start)))
 
@@ -235,9 +234,7 @@ class _Search:
 
     def nearest(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
         """Return the free states that are nearest in time, see :meth:`free`."""
-        durations = self.durations(states)
-        self._least = min(self._least, *durations, np.inf)
-        return self.free(states, durations, count, apart, taken)
+        return self.free(states, self.durations(states), count, apart, taken)
 
     def costs(self, states: Array) -> Array:
         """Return the durations to states, more by a share where the straight lines to them collide, shape (N,) [s]."""
@@ -263,10 +260,13 @@ class _Search:
         best = np.concatenate([near, known[order]])
         best = self.free(best, self.costs(best), NEAREST, NEAR)
         costs = self.costs(best)
-        for turn in range(MOST_ROUNDS):
-            duration = float(self.durations(best[:1])[0])
-            if turn >= ROUNDS and duration <= MUCH_NEARER * self._least:
+        least, idle = np.inf, 0
+        for _ in range(MOST_ROUNDS):
+            idle = 0 if costs[0] < LOWER * least else idle + 1
+            least = min(least, costs[0])
+            if idle >= PATIENCE:
                 break
+            duration = float(self.durations(best[:1])[0])
             children = self._children(best, PULL, direct_reach(duration, self.limits))
             children = children[self.durations(children) < costs.max()]
             if len(children):
