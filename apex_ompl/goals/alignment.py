@@ -161,7 +161,7 @@ class AlignmentGoal:
         self._radial = lip_direction(held[str(alignment.first)]) if pours else None
         self._data = robot.model.createData()
         self._lock = ProcessLock()  # of the data
-        self._inverse = Links.of(robot).inverse(self.targets(), self._hand_joints())
+        self.inverse = Links.of(robot).inverse(self.targets(), self._hand_joints())
 
     def _face(self, field: str, named: str | WorldVector, held: Mapping[str, AttachedObject]) -> LinkFace:
         if isinstance(named, WorldVector):
@@ -251,18 +251,6 @@ class AlignmentGoal:
         elif self.alignment.kind == "horizontal":
             targets.append(angle_target(a1, up))
         return targets
-
-    def attempt(self, rng: np.random.Generator) -> Array:
-        """Return the result of inverse kinematics from a random state around home, shape (dof,).
-
-        The hand synergies are those of the start.
-        """
-        q0 = self.robot.home + rng.normal(0.0, RESTART_SPREAD, self.robot.dof)
-        hands = self._hand_joints()
-        q0[hands] = self.start[hands]
-        limits = self.robot.limits
-        ends: Array = self._inverse.descend(np.clip(q0, limits.lower, limits.upper)).states[0]
-        return ends
 
     def _hand_joints(self) -> NDArray[np.intp]:
         names = [h.synergy for h in self.robot.hands.values() if h.synergy is not None]

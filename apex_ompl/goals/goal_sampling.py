@@ -1,4 +1,10 @@
-"""Sampling of free states that reach a goal given in the workspace, by inverse kinematics from random states."""
+"""Sampling of free states that reach a goal given in the workspace, those near the start in time first.
+
+Inverse kinematics descends from states around the start, near and far. Each state found is moved within the goal to
+where its direct motion from the start is fastest, locally (:meth:`apex_ompl.kernel.IKSolver.approach`). As that knows
+no obstacles, the nearest free states are then improved by random search: perturbed, pulled towards the start, brought
+back to the goal, and kept where they are free and nearer.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +16,50 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.alignment import within
+from apex_ompl.kernel import IKDescents, IKSolver
+from apex_ompl.robot import Robot
+from apex_ompl.robot.rest_to_rest import direct_durations, direct_reach
 from apex_ompl.types import Array
+
+BATCH = 32  # descents at once
+FEW = 64  # descents after which one free state is enough
+FARTHEST = 1.2  # largest standard deviation of states around the start [rad]
+HOME_SPREAD = 0.6  # standard deviation of states around home [rad]
+TOLERANCE = 1e-6  # norm of the residual at which a descent stops
+REACHED = 1e-4  # largest norm of the residual of states that reach the goal, or half of the least tolerance
+DESCENT_STEPS = 40  # most steps of a descent from a random state
+RETURN_STEPS = 20  # most steps of a descent back to the goal
+KEPT = 0.75  # share of the states that are kept for the next power, the nearest
+POWERS = 2, 4, 8, 16  # of the distances, one after the other
+WEIGHTS = 1e2, 4e2, 1e3, 4e3  # of the residuals, for each power
+NEAREST = 4  # states that are improved by random search
+NEAR, APART = 0.1, 0.5  # least distance, of the joint that moves most, of the nearest states, and of others [rad]
+SAME = 0.02  # distance up to which states collide where one does [rad]
+MARGIN = 0.05  # clearance that is enough [m]
+CLEARING_ROUNDS = 12  # of random search for a free state
+CHILDREN = 16  # states of a round of random search
+MOST_ROUNDS = 20  # of random search
+LOWER, PATIENCE = 0.99, 4  # ratio of costs, and rounds after which it ends without one lower by it
+SPREADS = 0.02, 0.3  # least and largest standard deviation of perturbations, as a share of the joints' reach
+ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares of it
+DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
+PULL = 0.3  # largest share of the way to the start
 
 
 class WorkspaceGoal(Protocol):
     """A goal that is reached where some errors are within their bounds."""
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+
+    @property
+    def start(self) -> Array:
+        """The start, shape (dof,)."""
+
+    @property
+    def inverse(self) -> IKSolver:
+        """Inverse kinematics of the goal."""
 
     @property
     def bounds(self) -> Mapping[str, float]:
@@ -22,9 +67,6 @@ class WorkspaceGoal(Protocol):
 
     def errors(self, q: Array) -> Mapping[str, float]:
         """Return the error terms at a state, shape (dof,), all 0 or more."""
-
-    def attempt(self, rng: np.random.Generator) -> Array:
-        """Return the result of inverse kinematics from a random state, shape (dof,)."""
 
 
 @dataclass(frozen=True)
@@ -59,37 +101,208 @@ class GoalSamples:
 def sample(
     goal: WorkspaceGoal, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
 ) -> GoalSamples:
-    """Sample free states that reach a goal.
+    """Sample free states that reach a goal: the nearest to the start in time, then others that are apart from them.
 
     Args:
         goal: The goal.
         checker: Checks the states for collision.
-        rng: Source of the initial states.
-        count: Number of states to find.
-        max_attempts: Largest number of attempts.
+        rng: Source of random numbers.
+        count: Most states to return.
+        max_attempts: Most descents from random states.
     """
-    states: list[Array] = []
+    search = _Search(goal, checker, rng)
+    attempts = converged = 0
     best: Mapping[str, float] = {}
-    converged = attempts = 0
-    colliding: Array | None = None
-    while attempts < max_attempts and len(states) < count:
-        attempts += 1
-        q = goal.attempt(rng)
-        errors = goal.errors(q)
+    near = others = np.empty((0, checker.robot.dof))
+    while attempts < max_attempts and len(near) < (min(count, NEAREST) if attempts < FEW else 1):
+        states = search.first_states(min(BATCH, max_attempts - attempts), around_home=attempts > 0)
+        ends = search.descended(states, DESCENT_STEPS)
+        attempts += len(states)
+        errors = goal.errors(ends.states[int(np.argmin(ends.errors))])
         if not best or relative_error(errors, goal.bounds) < relative_error(best, goal.bounds):
             best = errors
-        if not within(errors, goal.bounds):
-            continue
-        converged += 1
-        if checker.is_free(q):
-            states.append(q)
+        reached = search.reached(ends)
+        converged += len(reached)
+        others = np.concatenate([others, reached])
+        if len(search.nearest(others, 1, APART)):
+            found = np.concatenate([near, reached, *search.approached(reached)])
         else:
-            colliding = q
-    found = np.array(states).reshape(-1, checker.robot.dof)
+            found = others = np.concatenate([others, search.cleared(reached)])
+        near = search.nearest(found, min(count, NEAREST), NEAR)
+    near = search.improved(near, np.concatenate([near, found, others]))
+    states = np.concatenate([near, search.nearest(others, count - len(near), APART, near)])
     blocked = ""
-    if colliding is not None and not states:
-        blocked = str(next(iter(checker.contacts(colliding)), "in collision"))
-    return GoalSamples(found, attempts, converged, best, blocked)
+    if search.colliding is not None and not len(states):
+        blocked = str(next(iter(checker.contacts(search.colliding)), "in collision"))
+    return GoalSamples(states, attempts, converged, best, blocked)
+
+
+class _Search:
+    """Search for states of a goal that are near the start in time.
+
+    Attributes:
+        colliding: A state that reaches the goal in collision, or None.
+    """
+
+    def __init__(self, goal: WorkspaceGoal, checker: CollisionChecker, rng: np.random.Generator) -> None:
+        self.goal, self.checker, self.rng = goal, checker, rng
+        self.limits = goal.robot.limits
+        self.start = goal.start.clip(self.limits.lower, self.limits.upper)
+        self.colliding: Array | None = None
+        self._reached = min(REACHED, *(bound / 2.0 for bound in goal.bounds.values() if bound))
+        self._known: dict[bytes, bool] = {}  # whether a state is free
+        self._blocked = np.empty((0, len(self.start)))
+
+    def durations(self, states: Array) -> Array:
+        """Return the least durations of direct motions to states, shape (N,) [s]."""
+        return direct_durations(self.start, states, self.limits)
+
+    def first_states(self, count: int, around_home: bool) -> Array:
+        """Return random states from which inverse kinematics descends, shape (count, dof).
+
+        They are around the start, near and far, or every other one around home. Joints that do not matter for the goal
+        are as at the start.
+        """
+        free = self.goal.inverse.free
+        states, noise = np.tile(self.start, (count, 1)), self.rng.normal(size=(count, len(free)))
+        states[:, free] += np.linspace(0.0, FARTHEST, count)[:, None] * noise
+        if around_home:
+            states[1::2, free] = self.goal.robot.home[free] + HOME_SPREAD * noise[1::2]
+        return states.clip(self.limits.lower, self.limits.upper)
+
+    def descended(self, states: Array, max_steps: int) -> IKDescents:
+        """Return the ends of descents from states, shape (N, dof)."""
+        return self.goal.inverse.descend(states, tolerance=TOLERANCE, max_steps=max_steps)
+
+    def returned(self, states: Array) -> Array:
+        """Return the ends of descents from states, shape (N, dof), that reach the goal."""
+        ends = self.descended(states, RETURN_STEPS)
+        return ends.states[ends.errors <= self._reached]
+
+    def reached(self, ends: IKDescents) -> Array:
+        """Return the ends that reach the goal, shape (N, dof); inexactly only where none does so exactly."""
+        exact = ends.errors <= self._reached
+        if not exact.any():
+            exact = np.array([within(self.goal.errors(q), self.goal.bounds) for q in ends.states])
+        return ends.states[exact]
+
+    def approached(self, states: Array) -> list[Array]:
+        """Return states moved within the goal towards the start, for each power, shape (N, dof) each."""
+        found = list[Array]()
+        for power, weight in zip(POWERS, WEIGHTS, strict=True):
+            durations = self.durations(states)
+            states = states[np.argsort(durations, kind="stable")[: max(int(KEPT * len(states)), 1)]]
+            reach = direct_reach(float(durations.min()), self.limits)
+            ends = self.goal.inverse.approach(states, self.start, reach, power, weight=weight)
+            states = self.returned(ends.states)
+            if not len(states):
+                break
+            found.append(states)
+        return found
+
+    def cleared(self, states: Array) -> Array:
+        """Return states of the goal with more clearance, by random search, shape (N, dof)."""
+        best = states[:0]
+        clearances = np.empty(0)
+        for _ in range(CLEARING_ROUNDS if len(states) else 0):
+            best, clearances = np.concatenate([best, states]), np.append(clearances, self._clearances(states))
+            order = np.argsort(-clearances, kind="stable")[:NEAREST]
+            best, clearances = best[order], clearances[order]
+            if self._is_free(best[0]):
+                break
+            states = self._children(best, 0.0, direct_reach(float(self.durations(best).min()), self.limits))
+        return best
+
+    def free(self, states: Array, costs: Array, count: int, apart: float, taken: Array | None = None) -> Array:
+        """Return the free states of least cost, up to a number of them, that are apart from each other.
+
+        Args:
+            states: States that reach the goal, shape (N, dof).
+            costs: Their costs, shape (N,).
+            count: Their largest number.
+            apart: Least distance, of the joint that moves most.
+            taken: States from which they are to be apart, too, shape (M, dof).
+        """
+        found = np.empty((0, states.shape[1])) if taken is None else taken
+        first = len(found)
+        for q in states[np.argsort(costs, kind="stable")]:
+            if len(found) - first >= count:
+                break
+            if not (np.abs(found - q).max(axis=1) < apart).any() and self._is_free(q):
+                found = np.concatenate([found, q[None]])
+        return found[first:]
+
+    def nearest(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
+        """Return the free states that are nearest in time, see :meth:`free`."""
+        return self.free(states, self.durations(states), count, apart, taken)
+
+    def costs(self, states: Array) -> Array:
+        """Return the durations to states, more by a share where the straight lines to them collide, shape (N,) [s]."""
+        ends = self.checker.kernel.clearance(np.concatenate([self.start[None], states]), 0.0)
+        lines = self.start + ALONG[:, None, None] * (states - self.start)
+        clearances = self.checker.kernel.clearance(lines.reshape(-1, states.shape[1]), 0.0)
+        least = np.minimum(ends[0], ends[1:])
+        depths = np.maximum(least - clearances.reshape(len(ALONG), len(states), 2), 0.0).sum(axis=2).mean(axis=0)
+        costs: Array = self.durations(states) * (1.0 + DETOUR * depths / (depths + DEPTH))
+        return costs
+
+    def improved(self, near: Array, known: Array) -> Array:
+        """Return free states of lower cost by random search, the least one first, and nearest ones, shape (N, dof).
+
+        Args:
+            near: The nearest free states, shape (N, dof).
+            known: States that reach the goal, shape (M, dof).
+        """
+        if not len(near):
+            return near
+        durations = self.durations(known)
+        order = np.argsort(durations, kind="stable")[:CHILDREN]
+        best = np.concatenate([near, known[order]])
+        best = self.free(best, self.costs(best), NEAREST, NEAR)
+        costs = self.costs(best)
+        least, idle = np.inf, 0
+        for _ in range(MOST_ROUNDS):
+            idle = 0 if costs[0] < LOWER * least else idle + 1
+            least = min(least, costs[0])
+            if idle >= PATIENCE:
+                break
+            duration = float(self.durations(best[:1])[0])
+            children = self._children(best, PULL, direct_reach(duration, self.limits))
+            children = children[self.durations(children) < costs.max()]
+            if len(children):
+                both, all_costs = np.concatenate([best, children]), np.concatenate([costs, self.costs(children)])
+                better = all_costs <= costs.max()
+                best = self.free(both[better], all_costs[better], NEAREST, 0.0)
+                costs = self.costs(best)
+        best = best[:1]
+        return np.concatenate([best, self.nearest(np.concatenate([near, best]), NEAREST - 1, NEAR, best)])
+
+    def _children(self, parents: Array, pull: float, reach: Array) -> Array:
+        """Return states of the goal around others, shape (N, dof), up to a share ``pull`` of the way to the start."""
+        rng, free = self.rng, self.goal.inverse.free
+        children = parents[rng.integers(len(parents), size=CHILDREN)]
+        spread = np.exp(rng.uniform(*np.log(SPREADS), (CHILDREN, 1)))
+        change = spread * reach * rng.normal(size=children.shape)
+        change += pull * rng.random((CHILDREN, 1)) * (self.start - children)
+        children[:, free] += change[:, free]
+        return self.returned(children)
+
+    def _clearances(self, states: Array) -> Array:
+        """Return the sum of the least clearances to obstacles and of the robot to itself, shape (N,) [m]."""
+        clearances: Array = self.checker.kernel.clearance(states, MARGIN).sum(axis=1)
+        return clearances
+
+    def _is_free(self, q: Array) -> bool:
+        """Whether a state is free."""
+        key = q.tobytes()
+        if key not in self._known:
+            if (np.abs(self._blocked - q).max(axis=1) < SAME).any():
+                return False
+            self._known[key] = free = self.checker.is_free(q)
+            if not free:
+                self.colliding = q
+                self._blocked = np.concatenate([self._blocked, q[None]])
+        return self._known[key]
 
 
 def unit_of(name: str) -> str:

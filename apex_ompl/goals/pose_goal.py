@@ -18,7 +18,6 @@ from apex_ompl.scene.problem import PoseTarget
 from apex_ompl.types import Array
 from apex_ompl.util.forking import ProcessLock
 
-SPREAD = 0.6  # largest standard deviation of initial states around the start [rad]
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
 RESIDUAL = 1e-6  # largest residual at which inverse kinematics ends
 
@@ -64,7 +63,7 @@ class PoseGoal:
         self._lock = ProcessLock()  # of the data
         names = [h.synergy for h in robot.hands.values() if h.synergy is not None]
         hands = np.array([robot.joint_names.index(name) for name in names], dtype=np.intp)
-        self._inverse = Links.of(robot).inverse(self.targets(), hands)
+        self.inverse = Links.of(robot).inverse(self.targets(), hands)
 
     def placements(self, q: Array) -> list[Array]:
         """Return the poses of the frames in the world at a state, shape (4, 4) each [m]."""
@@ -109,17 +108,8 @@ class PoseGoal:
 
     def nearest(self, q: Array) -> Array:
         """Return the result of inverse kinematics from a state, shape (dof,); it need not reach the poses."""
-        found: Array = self._inverse.descend(np.asarray(q, float), tolerance=RESIDUAL).states[0]
+        found: Array = self.inverse.descend(np.asarray(q, float), tolerance=RESIDUAL).states[0]
         return found
-
-    def attempt(self, rng: np.random.Generator) -> Array:
-        """Return the result of inverse kinematics from a state around the start, near or far, shape (dof,)."""
-        moved = self._inverse.free
-        q0 = self.start.copy()
-        q0[moved] += rng.normal(0.0, SPREAD * rng.random(), len(moved))
-        limits = self.robot.limits
-        q0[moved] = np.clip(q0[moved], limits.lower[moved], limits.upper[moved])
-        return self.nearest(q0)
 
 
 def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject]) -> Frame:

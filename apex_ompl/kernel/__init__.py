@@ -2,6 +2,7 @@
 
 from apex_ompl.kernel.inverse_kinematics import (
     FixedVector,
+    IKDescents,
     IKSolver,
     Target,
     angle_target,
@@ -14,6 +15,7 @@ from apex_ompl.kernel.tables import RobotTables, SceneTables
 
 __all__ = [
     "FixedVector",
+    "IKDescents",
     "IKSolver",
     "Kernel",
     "Primitive",

@@ -16,6 +16,7 @@ from apex_ompl.kernel.compiled.robot.inverse_kinematics import (
     OFFSET,
     OPPOSITION,
     TargetArrays,
+    approach,
     descend,
     ik_buffer_sizes,
     residual_and_jacobian,
@@ -198,12 +199,51 @@ class IKSolver:
         Raises:
             ParameterError: Another shape.
         """
-        ends = np.array(states, float, order="C", ndmin=2)
-        if ends.ndim != 2 or ends.shape[1] != self.robot.dof:
-            raise shape_error(ends, ("N", self.robot.dof), "states")
-        errors, counts = np.empty(len(ends)), np.empty(len(ends), np.int64)
+        ends, errors, counts = self._ends(states)
         descend(
             *self.robot.packed, *self._memory(self._workspace_sizes), self._chain, self.free, *self._targets, ends,
             errors, counts, float(tolerance), int(max_steps), float(damping), *self._memory(self._buffer_sizes),
         )  # fmt: skip
         return IKDescents(ends, errors, counts)
+
+    def approach(
+        self, states: ArrayLike, start: Array, reach: Array, power: int, *, weight: float = 1e3, max_steps: int = 12
+    ) -> IKDescents:
+        """Move states towards a start, with the targets as a penalty, inside the limits.
+
+        The sum over joints of (distance / reach)^power becomes less, locally; with a high power that is the largest
+        of them. A :meth:`descend` brings the ends back to the targets.
+
+        Args:
+            states: First states, shape (N, dof).
+            start: The start, shape (dof,).
+            reach: Distances of the joints that count as equal, above 0, shape (dof,).
+            power: Even, 2 or more.
+            weight: Of the residuals.
+            max_steps: Most steps to take.
+
+        Raises:
+            ParameterError: Another shape, a reach that is not above 0, or another power.
+        """
+        ends, errors, counts = self._ends(states)
+        start, reach = compact(start), compact(reach)
+        for name, value in (("start", start), ("reach", reach)):
+            if value.shape != (self.robot.dof,):
+                raise shape_error(value, (self.robot.dof,), name)
+        if not (reach > 0.0).all():
+            raise ParameterError("reach", reach.min(), "distances above 0")
+        if power < 2 or power % 2:
+            raise ParameterError("power", power, "an even number from 2")
+        approach(
+            *self.robot.packed, *self._memory(self._workspace_sizes), self._chain, self.free, *self._targets, start,
+            reach, int(power), float(weight), ends, errors, counts, int(max_steps),
+            *self._memory(self._buffer_sizes),
+        )  # fmt: skip
+        return IKDescents(ends, errors, counts)
+
+    def _ends(self, states: ArrayLike) -> tuple[Array, Array, NDArray[np.int64]]:
+        """Return a copy of states, shape (N, dof), and memory for errors and numbers of steps."""
+        ends = np.array(states, float, order="C", ndmin=2)
+        if ends.ndim != 2 or ends.shape[1] != self.robot.dof:
+            raise shape_error(ends, ("N", self.robot.dof), "states")
+        return ends, np.empty(len(ends)), np.empty(len(ends), np.int64)

@@ -14,12 +14,14 @@ import numpy as np
 
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.errors import TimingError
+from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import FullCheck, MotionValidator, StateValidityChecker, full_check
-from apex_ompl.paths.path import Path
+from apex_ompl.paths.path import SEARCH_RESOLUTION, Path
 from apex_ompl.robot.model import Limits
+from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing import MotionLimits, TimedPath, Timing, Trajectory
-from apex_ompl.timing.duration import DurationOptimizer, direct_durations
+from apex_ompl.timing.duration import DurationOptimizer
 from apex_ompl.timing.parameterization import fitted
 from apex_ompl.timing.ruckig_method import calm as calm_motion
 from apex_ompl.timing.spline_method import whole_nanoseconds
@@ -31,9 +33,12 @@ if TYPE_CHECKING:
 
 OPTIMIZED = "optimized"  # form of a motion that is not along a path
 REPAIRS = 3  # of a motion that is not proved
-GOALS = 3  # other goals to which a straight motion is tried
+GOALS = 4  # other goals to which a straight motion is tried
 SOONER = 0.95  # share of the duration that the lower bound of another goal must not reach
 STATES_PER_KNOT = 2, 4, 8  # of the path along a motion; the first that passes the full check
+DETOUR, WAYS = 1.15, 2  # ratio of a duration to the direct one, beyond which so many other paths are tried
+AS_SOON = 0.99  # share of the duration that these must not reach
+TREE_RANGE, ITERATIONS = 1.5, 6_000  # longest step of their trees [rad], and most iterations
 SHARE = 0.5  # of the time left
 FITTED = 0.02  # largest deviation of a motion that is timed anew for limits of torques and tool speeds [rad]
 
@@ -83,12 +88,12 @@ def optimized_motion(
 
     search = _Search(optimizer, timing.method, check, stop)
     found = search.proved(optimizer.fastest(path.states, stop))
-    for goal in _sooner_goals(setup, path, limits, found):
-        if stop():
+    for goal, least in _other_goals(setup, path, limits):
+        if found is not None and least >= SOONER * found.spline.duration:
             break
-        other = search.proved(optimizer.fastest(np.stack([setup.start, goal]), stop), repairs=1)
-        if other is not None and (found is None or other.spline.duration < found.spline.duration):
-            found = other
+        found = search.sooner(found, np.stack([setup.start, goal]), SOONER)
+    for other in _other_ways(setup, path, found, limits):
+        found = search.sooner(found, other, AS_SOON)
     if found is not None:
         calm = query.objective == "calm"
         found = search.lasting(
@@ -126,6 +131,12 @@ class _Search(NamedTuple):
             if turn <= repairs:
                 spline = self.optimizer.cleared(spline, turn)
         return None
+
+    def sooner(self, found: _Proved | None, states: Array, share: float) -> _Proved | None:
+        """Return the motion from another path, shape (N, dof), where it takes less than a share of the time."""
+        most = np.inf if found is None else share * found.spline.duration
+        other = None if self.stop() else self.proved(self.optimizer.fastest(states, self.stop, most), repairs=1)
+        return found if other is None or other.spline.duration >= most else other
 
     def lasting(self, found: _Proved, duration: float, calm: bool) -> _Proved | None:
         """Return a motion of a longer duration [s]: a calm one if asked and proved, else along the same curve."""
@@ -166,13 +177,26 @@ def _kept(
 def _sooner_goals(setup: PlanningSetup, path: Path, limits: Limits, found: _Proved | None) -> Iterator[Array]:
     """Yield other goals that could be reached sooner, the nearest in time first."""
     goals = setup.valid_goals
-    if len(goals) < 2:
-        return
+    goals = goals[(goals != path.states[-1]).any(axis=1)]
     durations = direct_durations(setup.start, goals, limits)
     most = np.inf if found is None else SOONER * found.spline.duration
     for k in np.argsort(durations, kind="stable")[:GOALS]:
         if durations[k] < most and not np.array_equal(goals[k], path.states[-1]):
             yield goals[k]
+
+
+def _other_ways(setup: PlanningSetup, path: Path, found: _Proved | None, limits: Limits) -> Iterator[Array]:
+    """Yield other paths to the goal, by new trees and shortcuts, where the motion takes a detour in time."""
+    ends = path.states[[0, -1]] if found is None else found.spline.control[[0, -1]]
+    direct = float(direct_durations(ends[0], ends[1:], limits)[0])
+    if found is not None and found.spline.duration <= DETOUR * direct:
+        return
+    kernel, rng = setup.checker.kernel.within(*setup.bounds), np.random.default_rng([setup.seed, WAYS])
+    for one in rng.spawn(WAYS):
+        trees = TreePair(kernel, ends[:1], ends[1:], TREE_RANGE, SEARCH_RESOLUTION, one)
+        way = trees.grow(ITERATIONS)
+        if way is not None:
+            yield shortcut(kernel, way, ENOUGH, RESOLUTION, one.spawn(1)[0])[0]
 
 
 def _with_path(setup: PlanningSetup, timed: TimedPath, proof: PathProof) -> ProvedMotion | None:

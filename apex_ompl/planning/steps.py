@@ -44,6 +44,7 @@ from apex_ompl.planning.query import Group, planned_joints
 from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
+from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.duration import CALM_FACTOR, DEFAULT_OBJECTIVE, check_objective
@@ -58,6 +59,7 @@ STRAIGHT_LINE = "straight line"
 UNNAMED = "unnamed"  # planner of a user's function before it is made
 NOT_PROVED = "a path was found but not proved in time"
 NOT_TIMED = "a path was found but not timed in time"
+FARTHER = 1.4  # ratio of the durations to goals up to which one is nearly as near
 REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
 
 
@@ -287,7 +289,7 @@ def straight_line(query: PlanQuery) -> FoundPath | None:
     """
     setup = query.setup
     with timed(query.times, "line"):
-        for goal in sorted(setup.valid_goals, key=lambda goal: float(np.linalg.norm(goal - setup.start))):
+        for goal in _goals_of_lines(query):
             if query.deadline.expired:
                 return _out_of_time(query)
             line = np.stack([setup.start, goal])
@@ -301,6 +303,21 @@ def straight_line(query: PlanQuery) -> FoundPath | None:
                 return FoundPath(query, PlanStatus.TIMEOUT, NOT_PROVED)
             query.rejected_lines.append(line)
     return None
+
+
+def _goals_of_lines(query: PlanQuery) -> Array:
+    """Return the valid goals to which straight lines are tried, the nearest by the objective first, shape (N, dof).
+
+    By time those much farther than the nearest are left to the planner, which may find a way to a nearer one.
+    """
+    setup, goals = query.setup, query.setup.valid_goals
+    if query.objective == "length":
+        return goals[np.argsort(np.linalg.norm(goals - setup.start, axis=1), kind="stable")]
+    durations = direct_durations(setup.start, goals, setup.robot.limits)
+    goals = goals[np.argsort(durations, kind="stable")]
+    if query.planner == NAME:
+        goals = goals[: np.count_nonzero(durations <= FARTHER * durations.min())]
+    return goals
 
 
 def prove(found: FoundPath, simplify: bool = True) -> ProvedPath:

@@ -35,9 +35,11 @@ MOST_CALM = 100.0
 RAMP = 0.25  # share of the first guess in which its speed grows, and falls
 RAMPS = 0.35  # duration of both [s]
 GUESS_STATES = 257  # of a path
-MARGIN = 0.005  # least clearance at the samples [m]
-CLOSER = 1.05, 0.004  # samples a round of repair adds to the last ones, as a factor, and margin [m]
+CLOSER = 0.004  # margin that a round of repair adds [m]
 MOST_SPANS = 400
+FEW_STATES = 33  # of a path, for its clearance
+DEEP, STUCK = -0.02, 0.8  # clearance of a motion with little hope [m], and least ratio to the one before a round
+SLOWER = 1.15  # ratio of its duration to the one that it is to undercut
 PROX = 1e-3
 LARGEST = 0.25  # change of a control point in a step [rad]
 DECREASE = 0.3
@@ -51,6 +53,7 @@ class Level:
     Attributes:
         rate: Knots a second, about.
         samples: Number of samples of a knot spacing.
+        margin: Least clearance at these; nearer ends of a motion are allowed for [m].
         horizon: Clearances above it are left out [m].
         slack: Factor on the least knot spacing at the start.
         mean: Mean of slacks times multipliers at the start.
@@ -59,6 +62,7 @@ class Level:
 
     rate: float
     samples: int
+    margin: float
     horizon: float
     slack: float
     mean: float
@@ -66,12 +70,12 @@ class Level:
 
 
 LEVELS = (
-    Level(10.0, 4, 0.04, 1.03, 1e-4, 4e-2),
-    Level(25.0, 4, 0.02, 1.01, 2e-5, 2e-2),
-    Level(57.0, 2, 0.02, 1.003, 5e-6, 5e-3),
+    Level(10.0, 4, 0.005, 0.04, 1.03, 1e-4, 4e-2),
+    Level(25.0, 4, 0.003, 0.02, 1.01, 2e-5, 2e-2),
+    Level(57.0, 2, 0.002, 0.02, 1.003, 5e-6, 5e-3),
 )
-CALM = Level(57.0, 3, 0.03, 1.0, 1e-4, 2e-2)
-REPAIR = Level(57.0, 4, 0.03, 1.01, 2e-5, 5e-3)
+CALM = Level(57.0, 3, 0.002, 0.03, 1.0, 1e-4, 2e-2)
+REPAIR = Level(57.0, 4, 0.001, 0.03, 1.01, 2e-5, 5e-3)
 
 
 def check_objective(objective: str, calm_factor: float) -> None:
@@ -88,14 +92,13 @@ def check_objective(objective: str, calm_factor: float) -> None:
 class DurationOptimizer:
     """Makes motions fast, or calm, among the static obstacles of a kernel."""
 
-    def __init__(self, kernel: Kernel, limits: Limits, held: Flags | None = None, margin: float = MARGIN) -> None:
+    def __init__(self, kernel: Kernel, limits: Limits, held: Flags | None = None) -> None:
         """Optimize motions of the kernel's robot.
 
         Args:
             kernel: The robot among its obstacles.
             limits: Limits of the motions.
             held: Whether joints stay, shape (dof,).
-            margin: Least clearance that is aimed at; nearer ends of a motion are allowed for [m].
 
         Raises:
             ParameterError: The limits are those of other joints.
@@ -103,33 +106,42 @@ class DurationOptimizer:
         dof = kernel.robot.dof
         if len(limits.velocity) != dof:
             raise ParameterError("limits", len(limits.velocity), f"those of {dof} joints")
-        self.kernel, self.limits, self.margin = kernel, limits, margin
+        self.kernel, self.limits = kernel, limits
         self._held = np.zeros(dof, bool) if held is None else held
         self._limits = np.stack([limits.velocity, limits.acceleration, limits.jerk])
         self._limits[:, self._held] = 0.0
 
-    def fastest(self, states: Array, stop: Callable[[], bool] = lambda: False) -> TimedSpline | None:
+    def fastest(
+        self, states: Array, stop: Callable[[], bool] = lambda: False, most: float = np.inf
+    ) -> TimedSpline | None:  # fmt: skip
         """Return a locally fastest motion near a path.
 
         Args:
             states: The path, shape (N, dof).
             stop: Called between rounds; True ends the optimization.
+            most: Duration that the motion is to undercut [s]; where a round leaves little hope, the rest are left out.
 
         Returns:
-            The motion from the first state to the last, or None where these are one, the path cannot be cleared, or
-            ``stop`` returned True.
+            The motion from the first state to the last, or None where these are one, the path cannot be cleared,
+            ``stop`` returned True, or little hope is left.
 
         Raises:
             ParameterError: The path has another shape.
         """
         check_states(states, self.kernel.robot.dof, "path", least=1)
         spline = self._guess(states)
+        to_undercut = np.isfinite(most)
+        clearance = float(self.kernel.clearance(resample(states, FEW_STATES)).min()) if to_undercut else 0.0
         for level in LEVELS:
             if spline is None or stop():
                 return None
             if level is not LEVELS[0]:
                 spline = self._refitted(spline, level)
-            spline, _ = self._lowered(spline, level)
+            spline, report = self._lowered(spline, level)
+            stuck = report.clearance < min(DEEP, STUCK * clearance)
+            if to_undercut and (stuck or spline.duration > SLOWER * most):
+                return None
+            clearance = report.clearance
         return spline
 
     def cleared(self, spline: TimedSpline, times: int = 1) -> TimedSpline:
@@ -139,7 +151,7 @@ class DurationOptimizer:
             spline: The motion.
             times: How often its repair was tried.
         """
-        better, _ = self._lowered(spline, REPAIR, samples=REPAIR.samples * times, margin=CLOSER[1] * times)
+        better, _ = self._lowered(spline, REPAIR, samples=REPAIR.samples * times, margin=CLOSER * times)
         return better
 
     def calmest(self, spline: TimedSpline) -> TimedSpline:
@@ -182,7 +194,7 @@ class DurationOptimizer:
         control[:, self._held] = control[0, self._held]
         spacing = max(spline.spacing if calm else 0.0, level.slack * least_knot_spacing(control, self.limits))
         settings = DurationSettings(
-            self.margin + margin, level.horizon + margin, PROX, level.mean, DECREASE, LARGEST, level.tolerance,
+            level.margin + margin, level.horizon + margin, PROX, level.mean, DECREASE, LARGEST, level.tolerance,
             0.0 if calm else 1.0, calm, STEPS,
         )  # fmt: skip
         grid = _grid(len(control), samples or level.samples)
@@ -190,30 +202,6 @@ class DurationOptimizer:
         least = least_knot_spacing(control, self.limits)
         final = max(spacing, least) if calm else least
         return TimedSpline(control, final, spline.start), report
-
-
-def direct_durations(start: Array, goals: Array, limits: Limits) -> Array:
-    """Return the least durations of motions from rest to rest, obstacles ignored, shape (N,) [s].
-
-    Every joint takes its fastest profile of constant jerks for the distance d: with the ramp a/j of the acceleration
-    T = d/v + v/a + a/j where the largest velocity v is reached, else T = a/j + sqrt((a/j)^2 + 4 d/a) where the largest
-    acceleration a is, else T = (32 d/j)^(1/3); where v < a^2/j, v is reached without a: T = d/v + 2 sqrt(v/j).
-
-    Args:
-        start: Start state, shape (dof,).
-        goals: Goal states, shape (N, dof).
-        limits: Limits of the joints.
-    """
-    d, (v, a, j) = np.abs(goals - start), (limits.velocity, limits.acceleration, limits.jerk)
-    ramp = a / j
-    short = v < a * ramp  # the largest velocity is reached before the largest acceleration
-    reach = np.where(short, 2.0 * v * np.sqrt(v / j), v * (v / a + ramp))  # distance from which v is reached
-    full = np.where(short, d / v + 2.0 * np.sqrt(v / j), d / v + v / a + ramp)
-    ramped = ramp + np.sqrt(ramp**2 + 4.0 * d / a)
-    jerky = np.cbrt(32.0 * d / j)
-    between = np.where(d >= 2.0 * a * ramp**2, ramped, jerky)
-    durations: Array = np.where(d >= reach, full, np.where(short, jerky, between)).max(axis=1)
-    return durations
 
 
 def _ramped(share: Array) -> Array:

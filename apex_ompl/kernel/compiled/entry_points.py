@@ -251,6 +251,13 @@ OTHERS: Functions = {
         + "i8[::1], i8[::1], i8[::1], f8[::1], f8[:, ::1], f8[::1], i8[::1], f8, i8, f8, i8[::1], f8[::1]",
         4,
     ),
+    "robot.inverse_kinematics.approach": (
+        ROBOT
+        + WORKSPACE
+        + "i8[::1], i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], i8, f8, f8[:, ::1], f8[::1], i8[::1], i8, "
+        + "i8[::1], f8[::1]",
+        3,
+    ),
     "robot.inverse_kinematics.residual_and_jacobian": (
         ROBOT + WORKSPACE + "i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[::1]",
         2,

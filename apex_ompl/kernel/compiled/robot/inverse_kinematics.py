@@ -142,6 +142,10 @@ def _add_projected_columns(
 
 
 LEAST_DAMPING, MOST_DAMPING = 1e-9, 1e6
+FIRST_DAMPING = 1e-2
+NEARER = 0.05  # weight of the sum of squares beside that of high powers
+LEAST_SIZE = 1e-6
+LEAST_DECREASE = 1e-3  # of the merit function in a step, relative
 
 
 class Buffers(NamedTuple):
@@ -294,6 +298,115 @@ def descend(
                 damping *= 4.0
                 if damping > MOST_DAMPING:
                     break
+        errors[s], counts[s] = error, count
+
+
+@inlined
+def _nearness(
+    t: RobotArrays, w: Workspace, q: Floats, chain: Integers, free: Integers, targets: TargetArrays, start: Floats,
+    reach: Floats, size: float, power: int, weight: float, b: Buffers, gram: Floats, gradient: Floats,
+) -> tuple[float, float]:  # fmt: skip
+    """Put Hessian (lower half) and gradient of the merit function of :func:`approach` at a state into the buffers.
+
+    Returns:
+        The merit function and |r|.
+    """
+    error = _normal_equations(t, w, q, chain, free, targets, b, gram, gradient)
+    merit, n = 0.5 * weight * error * error, len(free)
+    for i in range(n):
+        unit = 1.0 / (size * reach[free[i]])
+        u = (q[free[i]] - start[free[i]]) * unit
+        high = 1.0  # u^(power - 2)
+        for _ in range(power // 2 - 1):
+            high *= u * u
+        merit += u * u * (high / power + 0.5 * NEARER)
+        gradient[i] = weight * gradient[i] + unit * u * (high + NEARER)
+        for k in range(i + 1):
+            gram[i, k] *= weight
+        gram[i, i] += unit * unit * ((power - 1.0) * high + NEARER)
+    return merit, error
+
+
+@entry_point
+def approach(
+    ri: Integers, rf: Floats, wi: Integers, wf: Floats, chain: Integers, free: Integers, ti: Integers, tf: Floats,
+    start: Floats, reach: Floats, power: int, weight: float, states: Floats, errors: Floats, counts: Integers,
+    max_steps: int, bi: Integers, bf: Floats,
+) -> None:  # fmt: skip
+    """Move each of ``states`` (N, dof) towards a start, inside the limits, with the targets as a penalty.
+
+    With u_i = (q_i - start_i) / (s reach_i), where s makes the largest u_i of the first state 1, it minimizes
+
+        sum_i (u_i^p / p + NEARER u_i^2 / 2) + weight |r|^2 / 2
+
+    for an even p; with growing p the largest u_i becomes what counts. Newton steps, of the residuals Gauss and
+    Newton's, are damped as in :func:`descend`; joints at a limit beyond which the gradient points stay.
+
+    Args:
+        ri: Robot, packed; see :func:`apex_ompl.kernel.compiled.layout.pack`.
+        rf: Robot.
+        wi: Workspace.
+        wf: Workspace.
+        chain: Joints to place, parents first.
+        free: Planned joints that may move, shape (n,).
+        ti: Targets, packed.
+        tf: Targets.
+        start: The start, shape (dof,).
+        reach: Distances of the joints that count as equal, above 0, shape (dof,).
+        power: p, even.
+        weight: Of the residuals.
+        states: First states, shape (N, dof); they are replaced by the ends.
+        errors: Gets the norms |r| at the ends, shape (N,).
+        counts: Gets the steps taken, shape (N,).
+        max_steps: Most steps.
+        bi: Buffers, see :func:`ik_buffer_sizes`.
+        bf: Buffers.
+    """
+    t, targets = robot_view(ri, rf), targets_view(ti, tf)
+    w = workspace_view(t, wi, wf)
+    dof, n = states.shape[1], len(free)
+    b = _buffers(bi, bf, (dof, n))
+    for s in range(len(states)):
+        q, now, size = states[s], 0, 0.0
+        for i in range(n):
+            k = free[i]
+            q[k] = min(max(q[k], t.lower[k]), t.upper[k])
+            size = max(size, abs(q[k] - start[k]) / reach[k])
+        size = max(size, LEAST_SIZE)
+        for i in range(dof):
+            b.trial[i] = q[i]
+        damping = FIRST_DAMPING
+        merit, error = _nearness(
+            t, w, q, chain, free, targets, start, reach, size, power, weight, b, b.gram[now], b.gradient[now]
+        )
+        count, decrease = 0, merit
+        while count < max_steps and damping <= MOST_DAMPING and decrease > LEAST_DECREASE * merit:
+            count += 1
+            for i in range(n):
+                k, slope = free[i], b.gradient[now, i]
+                b.step[i] = -slope
+                if (q[k] <= t.lower[k] and slope > 0.0) or (q[k] >= t.upper[k] and slope < 0.0):
+                    b.step[i] = 0.0
+                    for m in range(n):
+                        b.gram[now, max(i, m), min(i, m)] = 1.0 if m == i else 0.0
+            better = _solve(b.gram[now], damping, b.factor, b.step)
+            if better:
+                for i in range(n):
+                    k = free[i]
+                    b.trial[k] = min(max(q[k] + b.step[i], t.lower[k]), t.upper[k])
+                new_merit, new_error = _nearness(
+                    t, w, b.trial, chain, free, targets, start, reach, size, power, weight, b, b.gram[1 - now],
+                    b.gradient[1 - now],
+                )  # fmt: skip
+                better = new_merit < merit
+            if better:
+                for i in range(n):
+                    q[free[i]] = b.trial[free[i]]
+                decrease = merit - new_merit
+                merit, error, now = new_merit, new_error, 1 - now
+                damping = max(damping / 3.0, LEAST_DAMPING)
+            else:
+                damping *= 4.0
         errors[s], counts[s] = error, count
 
 

@@ -1,0 +1,45 @@
+"""Motions of single joints from rest to rest: durations by distance, and distances by duration, obstacles ignored.
+
+The fastest profile of constant jerks for the distance d: with the ramp a/j of the acceleration T = d/v + v/a + a/j
+where the largest velocity v is reached, else T = a/j + sqrt((a/j)^2 + 4 d/a) where the largest acceleration a is, else
+T = (32 d/j)^(1/3); where v < a^2/j, v is reached without a: T = d/v + 2 sqrt(v/j).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from apex_ompl.robot.model import Limits
+from apex_ompl.types import Array
+
+
+def direct_durations(start: Array, goals: Array, limits: Limits) -> Array:
+    """Return the least durations of motions from rest to rest, obstacles ignored, shape (N,) [s].
+
+    Args:
+        start: Start state, shape (dof,).
+        goals: Goal states, shape (N, dof).
+        limits: Limits of the joints.
+    """
+    d, (v, a, j) = np.abs(goals - start), (limits.velocity, limits.acceleration, limits.jerk)
+    ramp = a / j
+    short = v < a * ramp  # the largest velocity is reached before the largest acceleration
+    reach = np.where(short, 2.0 * v * np.sqrt(v / j), v * (v / a + ramp))  # distance from which v is reached
+    full = np.where(short, d / v + 2.0 * np.sqrt(v / j), d / v + v / a + ramp)
+    ramped = ramp + np.sqrt(ramp**2 + 4.0 * d / a)
+    jerky = np.cbrt(32.0 * d / j)
+    between = np.where(d >= 2.0 * a * ramp**2, ramped, jerky)
+    durations: Array = np.where(d >= reach, full, np.where(short, jerky, between)).max(axis=1)
+    return durations
+
+
+def direct_reach(duration: float, limits: Limits) -> Array:
+    """Return how far the joints move from rest to rest in a duration [s], obstacles ignored, shape (dof,)."""
+    v, a, j = limits.velocity, limits.acceleration, limits.jerk
+    ramp = a / j
+    ramps = np.where(v < a * ramp, np.sqrt(v / j), (v / a + ramp) / 2.0)  # of the speed, half of both
+    jerky = j * duration**3 / 32.0
+    ramped = a * ((duration - ramp) ** 2 - ramp**2) / 4.0
+    between = np.where((v >= a * ramp) & (duration >= 4.0 * ramp), ramped, jerky)
+    distances: Array = np.where(duration >= 4.0 * ramps, v * (duration - 2.0 * ramps), between)
+    return distances
