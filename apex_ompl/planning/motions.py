@@ -174,15 +174,12 @@ def _kept(
     return None
 
 
-def _sooner_goals(setup: PlanningSetup, path: Path, limits: Limits, found: _Proved | None) -> Iterator[Array]:
-    """Yield other goals that could be reached sooner, the nearest in time first."""
+def _other_goals(setup: PlanningSetup, path: Path, limits: Limits) -> list[tuple[Array, float]]:
+    """Return the nearest goals at which the path does not end, with the least durations to them [s]."""
     goals = setup.valid_goals
     goals = goals[(goals != path.states[-1]).any(axis=1)]
     durations = direct_durations(setup.start, goals, limits)
-    most = np.inf if found is None else SOONER * found.spline.duration
-    for k in np.argsort(durations, kind="stable")[:GOALS]:
-        if durations[k] < most and not np.array_equal(goals[k], path.states[-1]):
-            yield goals[k]
+    return [(goals[k], float(durations[k])) for k in np.argsort(durations, kind="stable")[:GOALS]]
 
 
 def _other_ways(setup: PlanningSetup, path: Path, found: _Proved | None, limits: Limits) -> Iterator[Array]:

@@ -41,7 +41,8 @@ FEW_STATES = 33  # of a path, for its clearance
 DEEP, STUCK = -0.02, 0.8  # clearance of a motion with little hope [m], and least ratio to the one before a round
 SLOWER = 1.15  # ratio of its duration to the one that it is to undercut
 PROX = 1e-3
-LARGEST = 0.25  # change of a control point in a step [rad]
+LARGEST, CAREFUL = 0.25, 0.06  # change of a control point in a step, and where these go through an obstacle [rad]
+LOST = -0.01  # clearance of a motion that is on the wrong side of an obstacle [m]
 DECREASE = 0.3
 STEPS = 30
 
@@ -72,9 +73,9 @@ class Level:
 LEVELS = (
     Level(10.0, 4, 0.005, 0.04, 1.03, 1e-4, 4e-2),
     Level(25.0, 4, 0.003, 0.02, 1.01, 2e-5, 2e-2),
-    Level(57.0, 2, 0.002, 0.02, 1.003, 5e-6, 5e-3),
+    Level(57.0, 2, 0.001, 0.02, 1.003, 5e-6, 5e-3),
 )
-CALM = Level(57.0, 3, 0.002, 0.03, 1.0, 1e-4, 2e-2)
+CALM = Level(57.0, 3, 0.001, 0.03, 1.0, 1e-4, 2e-2)
 REPAIR = Level(57.0, 4, 0.001, 0.03, 1.01, 2e-5, 5e-3)
 
 
@@ -130,19 +131,20 @@ class DurationOptimizer:
         """
         check_states(states, self.kernel.robot.dof, "path", least=1)
         spline = self._guess(states)
+        if spline is None or stop():
+            return None
         to_undercut = np.isfinite(most)
         clearance = float(self.kernel.clearance(resample(states, FEW_STATES)).min()) if to_undercut else 0.0
-        for level in LEVELS:
-            if spline is None or stop():
-                return None
-            if level is not LEVELS[0]:
-                spline = self._refitted(spline, level)
-            spline, report = self._lowered(spline, level)
-            stuck = report.clearance < min(DEEP, STUCK * clearance)
-            if to_undercut and (stuck or spline.duration > SLOWER * most):
+        better, report = self._lowered(spline, LEVELS[0])
+        if report.clearance < LOST and not to_undercut:  # a step went through an obstacle
+            better, report = self._lowered(spline, LEVELS[0], largest=CAREFUL)
+        for level in LEVELS[1:]:
+            hopeless = report.clearance < (min(DEEP, STUCK * clearance) if to_undercut else LOST)
+            if hopeless or better.duration > SLOWER * most or stop():
                 return None
             clearance = report.clearance
-        return spline
+            better, report = self._lowered(self._refitted(better, level), level)
+        return better
 
     def cleared(self, spline: TimedSpline, times: int = 1) -> TimedSpline:
         """Return a motion that keeps more distance, of more samples, for one that was not proved.
@@ -186,7 +188,8 @@ class DurationOptimizer:
         return spline.refitted(max(spline.spans, wanted))
 
     def _lowered(
-        self, spline: TimedSpline, level: Level, *, calm: float = 0.0, samples: int = 0, margin: float = 0.0
+        self, spline: TimedSpline, level: Level, *, calm: float = 0.0, samples: int = 0, margin: float = 0.0,
+        largest: float = LARGEST,
     ) -> tuple[TimedSpline, DurationReport]:
         """Return a spline after the steps of a level, in its least duration or with ``calm`` in its own."""
         control = np.array(spline.control, order="C")
@@ -194,7 +197,7 @@ class DurationOptimizer:
         control[:, self._held] = control[0, self._held]
         spacing = max(spline.spacing if calm else 0.0, level.slack * least_knot_spacing(control, self.limits))
         settings = DurationSettings(
-            level.margin + margin, level.horizon + margin, PROX, level.mean, DECREASE, LARGEST, level.tolerance,
+            level.margin + margin, level.horizon + margin, PROX, level.mean, DECREASE, largest, level.tolerance,
             0.0 if calm else 1.0, calm, STEPS,
         )  # fmt: skip
         grid = _grid(len(control), samples or level.samples)
