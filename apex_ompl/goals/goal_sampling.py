@@ -116,7 +116,9 @@ def sample(
     attempts = converged = 0
     best: Mapping[str, float] = {}
     near = others = np.empty((0, checker.robot.dof))
-    while attempts < max_attempts and len(near) < (min(count, NEAREST) if attempts < FEW else 1):
+    while attempts < max_attempts and (
+        not len(near) or attempts < FEW and (len(near) < min(count, NEAREST) or converged < count)
+    ):
         states = search.first_states(min(BATCH, max_attempts - attempts), around_home=attempts > 0)
         ends = search.descended(states, DESCENT_STEPS)
         attempts += len(states)
