@@ -40,7 +40,7 @@ MARGIN = 0.05  # clearance that is enough [m]
 CLEARING_ROUNDS = 12  # of random search for a free state
 CHILDREN = 16  # states of a round of random search
 MOST_ROUNDS = 20  # of random search
-LOWER, PATIENCE = 0.99, 4  # ratio of costs, and rounds after which it ends without one lower by it
+LOWER, PATIENCE = 0.99, 5  # ratio of costs, and rounds after which it ends without one lower by it
 LOG_SPREADS = np.log(0.02), np.log(0.3)  # of the standard deviation of perturbations, as a share of the joints' reach
 ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares of it
 DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
@@ -221,8 +221,8 @@ class _Search:
             states = self._children(best, 0.0)
         return best
 
-    def free(self, states: Array, costs: Array, count: int, apart: float, taken: Array | None = None) -> Array:
-        """Return the free states of least cost, up to a number of them, that are apart from each other.
+    def free(self, states: Array, costs: Array, count: int, apart: float, taken: Array | None = None) -> list[int]:
+        """Return the rows of the free states of least cost, up to a number of them, that are apart from each other.
 
         Args:
             states: States that reach the goal, shape (N, dof).
@@ -231,18 +231,20 @@ class _Search:
             apart: Least distance, of the joint that moves most.
             taken: States from which they are to be apart, too, shape (M, dof).
         """
-        found = np.empty((0, states.shape[1])) if taken is None else taken
-        first = len(found)
-        for q in states[np.argsort(costs, kind="stable")]:
-            if len(found) - first >= count:
+        rows = list[int]()
+        taken = states[:0] if taken is None else taken
+        for row in np.argsort(costs, kind="stable"):
+            q = states[row]
+            if len(rows) >= count:
                 break
-            if not (np.abs(found - q).max(axis=1) < apart).any() and self._is_free(q):
-                found = np.concatenate([found, q[None]])
-        return found[first:]
+            if not (np.abs(taken - q).max(axis=1) < apart).any() and self._is_free(q):
+                rows.append(int(row))
+                taken = np.concatenate([taken, q[None]])
+        return rows
 
     def nearest(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
         """Return the free states that are nearest in time, see :meth:`free`."""
-        return self.free(states, self.durations(states), count, apart, taken)
+        return states[self.free(states, self.durations(states), count, apart, taken)]
 
     def costs(self, states: Array) -> Array:
         """Return the durations to states, more by a share where the straight lines to them collide, shape (N,) [s]."""
@@ -263,8 +265,9 @@ class _Search:
         """
         known = known[np.argsort(self.durations(known), kind="stable")[:CHILDREN]]
         best = np.concatenate([near, known])
-        best = self.free(best, self.costs(best), NEAREST, NEAR)
         costs = self.costs(best)
+        rows = self.free(best, costs, NEAREST, NEAR)
+        best, costs = best[rows], costs[rows]
         least, idle = np.inf, 0
         for _ in range(MOST_ROUNDS):
             idle = 0 if costs[0] < LOWER * least else idle + 1
@@ -274,10 +277,9 @@ class _Search:
             children = self._children(best, PULL)
             children = children[self.durations(children) < costs.max()]
             if len(children):
-                both, all_costs = np.concatenate([best, children]), np.concatenate([costs, self.costs(children)])
-                better = all_costs <= costs.max()
-                best = self.free(both[better], all_costs[better], NEAREST, 0.0)
-                costs = self.costs(best)
+                best, costs = np.concatenate([best, children]), np.append(costs, self.costs(children))
+                rows = self.free(best, costs, NEAREST, 0.0)
+                best, costs = best[rows], costs[rows]
         best = best[:1]
         return np.concatenate([best, self.nearest(np.concatenate([near, best]), NEAREST - 1, NEAR, best)])
 
