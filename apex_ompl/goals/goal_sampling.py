@@ -34,15 +34,17 @@ POWERS = 2, 4, 8, 16  # of the distances, one after the other
 WEIGHTS = 1e2, 4e2, 1e3, 4e3  # of the residuals, for each power
 NEAREST = 4  # states that are improved by random search
 NEAR, APART = 0.1, 0.5  # least distance, of the joint that moves most, of the nearest states, and of others [rad]
+FAR = 1.5  # ratio of the duration to a state to that of the nearest, up to which it is returned
 SAME = 0.02  # distance up to which states collide where one does [rad]
 MARGIN = 0.05  # clearance that is enough [m]
 CLEARING_ROUNDS = 12  # of random search for a free state
 CHILDREN = 16  # states of a round of random search
 MOST_ROUNDS = 20  # of random search
-LOWER, PATIENCE = 0.99, 4  # ratio of costs, and rounds after which it ends without one lower by it
-SPREADS = 0.02, 0.3  # least and largest standard deviation of perturbations, as a share of the joints' reach
+LOWER, PATIENCE = 0.99, 5  # ratio of costs, and rounds after which it ends without one lower by it
+LOG_SPREADS = np.log(0.02), np.log(0.3)  # of the standard deviation of perturbations, as a share of the joints' reach
 ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares of it
 DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
+SHORTEST = 0.05  # least duration for which the reach is computed [s]
 PULL = 0.3  # largest share of the way to the start
 
 
@@ -114,7 +116,9 @@ def sample(
     attempts = converged = 0
     best: Mapping[str, float] = {}
     near = others = np.empty((0, checker.robot.dof))
-    while attempts < max_attempts and len(near) < (min(count, NEAREST) if attempts < FEW else 1):
+    while attempts < max_attempts and (
+        not len(near) or attempts < FEW and (len(near) < min(count, NEAREST) or converged < count)
+    ):
         states = search.first_states(min(BATCH, max_attempts - attempts), around_home=attempts > 0)
         ends = search.descended(states, DESCENT_STEPS)
         attempts += len(states)
@@ -129,8 +133,13 @@ def sample(
         else:
             found = others = np.concatenate([others, search.cleared(reached)])
         near = search.nearest(found, min(count, NEAREST), NEAR)
-    near = search.improved(near, np.concatenate([near, found, others]))
+    if len(near):
+        near = search.improved(near, np.concatenate([near, found, others]))[:count]
+        others = others[search.durations(others) <= FAR * search.durations(near).min()]
     states = np.concatenate([near, search.nearest(others, count - len(near), APART, near)])
+    states = states[[within(goal.errors(q), goal.bounds) for q in states]]
+    if search.colliding is None and not len(states):
+        converged = 0
     blocked = ""
     if search.colliding is not None and not len(states):
         blocked = str(next(iter(checker.contacts(search.colliding)), "in collision"))
@@ -192,8 +201,7 @@ class _Search:
         for power, weight in zip(POWERS, WEIGHTS, strict=True):
             durations = self.durations(states)
             states = states[np.argsort(durations, kind="stable")[: max(int(KEPT * len(states)), 1)]]
-            reach = direct_reach(float(durations.min()), self.limits)
-            ends = self.goal.inverse.approach(states, self.start, reach, power, weight=weight)
+            ends = self.goal.inverse.approach(states, self.start, self._reach(states), power, weight=weight)
             states = self.returned(ends.states)
             if not len(states):
                 break
@@ -210,11 +218,11 @@ class _Search:
             best, clearances = best[order], clearances[order]
             if self._is_free(best[0]):
                 break
-            states = self._children(best, 0.0, direct_reach(float(self.durations(best).min()), self.limits))
+            states = self._children(best, 0.0)
         return best
 
-    def free(self, states: Array, costs: Array, count: int, apart: float, taken: Array | None = None) -> Array:
-        """Return the free states of least cost, up to a number of them, that are apart from each other.
+    def free(self, states: Array, costs: Array, count: int, apart: float, taken: Array | None = None) -> list[int]:
+        """Return the rows of the free states of least cost, up to a number of them, that are apart from each other.
 
         Args:
             states: States that reach the goal, shape (N, dof).
@@ -223,18 +231,20 @@ class _Search:
             apart: Least distance, of the joint that moves most.
             taken: States from which they are to be apart, too, shape (M, dof).
         """
-        found = np.empty((0, states.shape[1])) if taken is None else taken
-        first = len(found)
-        for q in states[np.argsort(costs, kind="stable")]:
-            if len(found) - first >= count:
+        rows = list[int]()
+        taken = states[:0] if taken is None else taken
+        for row in np.argsort(costs, kind="stable"):
+            q = states[row]
+            if len(rows) >= count:
                 break
-            if not (np.abs(found - q).max(axis=1) < apart).any() and self._is_free(q):
-                found = np.concatenate([found, q[None]])
-        return found[first:]
+            if not (np.abs(taken - q).max(axis=1) < apart).any() and self._is_free(q):
+                rows.append(int(row))
+                taken = np.concatenate([taken, q[None]])
+        return rows
 
     def nearest(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
         """Return the free states that are nearest in time, see :meth:`free`."""
-        return self.free(states, self.durations(states), count, apart, taken)
+        return states[self.free(states, self.durations(states), count, apart, taken)]
 
     def costs(self, states: Array) -> Array:
         """Return the durations to states, more by a share where the straight lines to them collide, shape (N,) [s]."""
@@ -253,36 +263,36 @@ class _Search:
             near: The nearest free states, shape (N, dof).
             known: States that reach the goal, shape (M, dof).
         """
-        if not len(near):
-            return near
-        durations = self.durations(known)
-        order = np.argsort(durations, kind="stable")[:CHILDREN]
-        best = np.concatenate([near, known[order]])
-        best = self.free(best, self.costs(best), NEAREST, NEAR)
+        known = known[np.argsort(self.durations(known), kind="stable")[:CHILDREN]]
+        best = np.concatenate([near, known])
         costs = self.costs(best)
+        rows = self.free(best, costs, NEAREST, NEAR)
+        best, costs = best[rows], costs[rows]
         least, idle = np.inf, 0
         for _ in range(MOST_ROUNDS):
             idle = 0 if costs[0] < LOWER * least else idle + 1
             least = min(least, costs[0])
             if idle >= PATIENCE:
                 break
-            duration = float(self.durations(best[:1])[0])
-            children = self._children(best, PULL, direct_reach(duration, self.limits))
+            children = self._children(best, PULL)
             children = children[self.durations(children) < costs.max()]
             if len(children):
-                both, all_costs = np.concatenate([best, children]), np.concatenate([costs, self.costs(children)])
-                better = all_costs <= costs.max()
-                best = self.free(both[better], all_costs[better], NEAREST, 0.0)
-                costs = self.costs(best)
+                best, costs = np.concatenate([best, children]), np.append(costs, self.costs(children))
+                rows = self.free(best, costs, NEAREST, 0.0)
+                best, costs = best[rows], costs[rows]
         best = best[:1]
         return np.concatenate([best, self.nearest(np.concatenate([near, best]), NEAREST - 1, NEAR, best)])
 
-    def _children(self, parents: Array, pull: float, reach: Array) -> Array:
+    def _reach(self, states: Array) -> Array:
+        """Return how far the joints move in the least duration to one of states, shape (dof,)."""
+        return direct_reach(max(float(self.durations(states).min()), SHORTEST), self.limits)
+
+    def _children(self, parents: Array, pull: float) -> Array:
         """Return states of the goal around others, shape (N, dof), up to a share ``pull`` of the way to the start."""
         rng, free = self.rng, self.goal.inverse.free
         children = parents[rng.integers(len(parents), size=CHILDREN)]
-        spread = np.exp(rng.uniform(*np.log(SPREADS), (CHILDREN, 1)))
-        change = spread * reach * rng.normal(size=children.shape)
+        spread = np.exp(rng.uniform(*LOG_SPREADS, size=(CHILDREN, 1)))
+        change = spread * self._reach(parents) * rng.normal(size=children.shape)
         change += pull * rng.random((CHILDREN, 1)) * (self.start - children)
         children[:, free] += change[:, free]
         return self.returned(children)

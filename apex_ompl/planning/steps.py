@@ -59,7 +59,6 @@ STRAIGHT_LINE = "straight line"
 UNNAMED = "unnamed"  # planner of a user's function before it is made
 NOT_PROVED = "a path was found but not proved in time"
 NOT_TIMED = "a path was found but not timed in time"
-FARTHER = 1.4  # ratio of the durations to goals up to which one is nearly as near
 REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
 
 
@@ -289,7 +288,7 @@ def straight_line(query: PlanQuery) -> FoundPath | None:
     """
     setup = query.setup
     with timed(query.times, "line"):
-        for goal in _goals_of_lines(query):
+        for goal in _nearest_first(query):
             if query.deadline.expired:
                 return _out_of_time(query)
             line = np.stack([setup.start, goal])
@@ -305,19 +304,12 @@ def straight_line(query: PlanQuery) -> FoundPath | None:
     return None
 
 
-def _goals_of_lines(query: PlanQuery) -> Array:
-    """Return the valid goals to which straight lines are tried, the nearest by the objective first, shape (N, dof).
-
-    By time those much farther than the nearest are left to the planner, which may find a way to a nearer one.
-    """
-    setup, goals = query.setup, query.setup.valid_goals
+def _nearest_first(query: PlanQuery) -> Array:
+    """Return the valid goals, the nearest first: in length with that objective, else in time; shape (goals, dof)."""
+    start, goals = query.setup.start, query.setup.valid_goals
     if query.objective == "length":
-        return goals[np.argsort(np.linalg.norm(goals - setup.start, axis=1), kind="stable")]
-    durations = direct_durations(setup.start, goals, setup.robot.limits)
-    goals = goals[np.argsort(durations, kind="stable")]
-    if query.planner == NAME:
-        goals = goals[: np.count_nonzero(durations <= FARTHER * durations.min())]
-    return goals
+        return goals[np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")]
+    return goals[np.argsort(direct_durations(start, goals, query.setup.robot.limits), kind="stable")]
 
 
 def prove(found: FoundPath, simplify: bool = True) -> ProvedPath:

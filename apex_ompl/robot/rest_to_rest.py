@@ -22,24 +22,26 @@ def direct_durations(start: Array, goals: Array, limits: Limits) -> Array:
         limits: Limits of the joints.
     """
     d, (v, a, j) = np.abs(goals - start), (limits.velocity, limits.acceleration, limits.jerk)
-    ramp = a / j
-    short = v < a * ramp  # the largest velocity is reached before the largest acceleration
-    reach = np.where(short, 2.0 * v * np.sqrt(v / j), v * (v / a + ramp))  # distance from which v is reached
-    full = np.where(short, d / v + 2.0 * np.sqrt(v / j), d / v + v / a + ramp)
-    ramped = ramp + np.sqrt(ramp**2 + 4.0 * d / a)
-    jerky = np.cbrt(32.0 * d / j)
-    between = np.where(d >= 2.0 * a * ramp**2, ramped, jerky)
-    durations: Array = np.where(d >= reach, full, np.where(short, jerky, between)).max(axis=1)
+    ramp, ramps = a / j, _ramps(limits)
+    ramped = np.where((v >= a * ramp) & (d >= 2.0 * a * ramp**2), ramp + np.sqrt(ramp**2 + 4.0 / a * d), 0.0)
+    durations: Array = np.where(
+        d >= 2.0 * v * ramps, d / v + 2.0 * ramps, np.where(ramped > 0.0, ramped, np.cbrt(32.0 / j * d))
+    ).max(axis=1)
     return durations
 
 
 def direct_reach(duration: float, limits: Limits) -> Array:
     """Return how far the joints move from rest to rest in a duration [s], obstacles ignored, shape (dof,)."""
     v, a, j = limits.velocity, limits.acceleration, limits.jerk
-    ramp = a / j
-    ramps = np.where(v < a * ramp, np.sqrt(v / j), (v / a + ramp) / 2.0)  # of the speed, half of both
-    jerky = j * duration**3 / 32.0
+    ramp, ramps = a / j, _ramps(limits)
     ramped = a * ((duration - ramp) ** 2 - ramp**2) / 4.0
-    between = np.where((v >= a * ramp) & (duration >= 4.0 * ramp), ramped, jerky)
+    between = np.where((v >= a * ramp) & (duration >= 4.0 * ramp), ramped, j * duration**3 / 32.0)
     distances: Array = np.where(duration >= 4.0 * ramps, v * (duration - 2.0 * ramps), between)
     return distances
+
+
+def _ramps(limits: Limits) -> Array:
+    """Return half of the duration in which the speed grows to the largest, shape (dof,) [s]."""
+    v, a, j = limits.velocity, limits.acceleration, limits.jerk
+    half: Array = np.where(v < a * (a / j), np.sqrt(v / j), (v / a + a / j) / 2.0)
+    return half
