@@ -201,7 +201,7 @@ def _with_path(setup: PlanningSetup, timed: TimedPath, proof: PathProof) -> Prov
     motion = timed.trajectory
     for count in STATES_PER_KNOT:
         states = motion(np.linspace(0.0, motion.duration, count * (len(motion.times) - 1) + 1))
-        states = states.clip(motion.positions.min(axis=0), motion.positions.max(axis=0))  # joints that stay do
+        states[:, setup.held] = setup.start[setup.held]
         states[0], states[-1] = motion.positions[0], motion.positions[-1]
         checked = full_check(setup.checker, states, setup.start, setup.goals)
         if checked and checked.proof is not None:

@@ -188,7 +188,13 @@ class DurationOptimizer:
         return spline.refitted(max(spline.spans, wanted))
 
     def _lowered(
-        self, spline: TimedSpline, level: Level, *, calm: float = 0.0, samples: int = 0, margin: float = 0.0,
+        self,
+        spline: TimedSpline,
+        level: Level,
+        *,
+        calm: float = 0.0,
+        samples: int = 0,
+        margin: float = 0.0,
         largest: float = LARGEST,
     ) -> tuple[TimedSpline, DurationReport]:
         """Return a spline after the steps of a level, in its least duration or with ``calm`` in its own."""
