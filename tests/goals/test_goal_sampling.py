@@ -20,6 +20,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.robot import Robot
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import Goal, PoseTarget, PoseTolerance, Problem
+from apex_ompl.timing.duration import DurationOptimizer
 
 ALIGNED = ("ball_in_cup", "peg_in_hole", "pour", "handover", "stack_boxes")
 
@@ -163,3 +164,27 @@ def test_faulty_approaches_are_named(robot: Robot) -> None:
     }.items():
         with pytest.raises(ParameterError, match=name):
             inverse.approach(*arguments)
+
+
+def test_a_motion_that_does_not_undercut_a_duration_is_left(robot: Robot, checker: CollisionChecker) -> None:
+    goal = robot.home.copy()
+    goal[3] += 0.8
+    optimizer = DurationOptimizer(checker.kernel, robot.limits)
+    line = np.stack([robot.home, goal])
+    fastest, undercut = optimizer.fastest(line), optimizer.fastest(line, most=10.0)
+    assert fastest is not None and undercut is not None
+    assert fastest.duration == undercut.duration and np.array_equal(fastest.control, undercut.control)
+    assert optimizer.fastest(line, most=0.8 * fastest.duration) is None
+
+
+def test_straight_lines_to_goals_are_tried_by_the_objective(robot: Robot, problem: Problem) -> None:
+    """One goal is nearer in length, the other in time, since several joints share its distance."""
+    start = problem.start_state(robot.joint_names)
+    one, several = start.copy(), start.copy()
+    one[3] += 0.6
+    several[[3, 10]] += 0.5, 0.45
+    joints = [dict(zip(robot.joint_names, goal.tolist(), strict=True)) for goal in (one, several)]
+    both = problem.model_copy(update={"scene": (), "goal": Goal(joints=tuple(joints))})
+    for objective, goal in (("length", one), ("time", several)):
+        result = plan(both, objective=objective)
+        np.testing.assert_allclose(result.path[-1], goal)
