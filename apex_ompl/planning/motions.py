@@ -183,14 +183,14 @@ def _other_goals(setup: PlanningSetup, path: Path, limits: Limits) -> list[tuple
 
 
 def _other_ways(setup: PlanningSetup, path: Path, found: _Proved | None, limits: Limits) -> Iterator[Array]:
-    """Yield other paths to the goal, by new trees and shortcuts, where the motion takes a detour in time."""
-    ends = path.states[[0, -1]] if found is None else found.spline.control[[0, -1]]
-    direct = float(direct_durations(ends[0], ends[1:], limits)[0])
-    if found is not None and found.spline.duration <= DETOUR * direct:
-        return
+    """Yield other paths, by new trees and shortcuts, where the motion takes much longer than a direct one to a goal."""
+    goals = np.concatenate([path.states[-1:], setup.valid_goals])
+    durations = direct_durations(setup.start, goals, limits)
+    most = np.inf if found is None else found.spline.duration / DETOUR
+    goals = goals[durations < most][: GOALS + 1]
     kernel, rng = setup.checker.kernel.within(*setup.bounds), np.random.default_rng([setup.seed, WAYS])
-    for one in rng.spawn(WAYS):
-        trees = TreePair(kernel, ends[:1], ends[1:], TREE_RANGE, SEARCH_RESOLUTION, one)
+    for one in rng.spawn(WAYS) if len(goals) else ():
+        trees = TreePair(kernel, setup.start[None], goals, TREE_RANGE, SEARCH_RESOLUTION, one)
         way = trees.grow(ITERATIONS)
         if way is not None:
             yield shortcut(kernel, way, ENOUGH, RESOLUTION, one.spawn(1)[0])[0]
