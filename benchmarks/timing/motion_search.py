@@ -1,0 +1,179 @@
+"""Multi-start search for the fastest motion of a problem, the reference of benchmarks/timing/motions.py.
+
+Paths come from apex and from tuned rrtconnect with further seeds, from straight lines through one or two random free
+states, and from the best motion so far, moved at random or led through a random free state. Each is the start of
+:class:`apex_ompl.timing.duration.DurationOptimizer` with one of several margins; the fastest motion that passes the
+full check counts. The search takes a time of CPU, and ends before where the lower bound is reached.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from apex_ompl import load_problem, plan
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.evaluation.runs import Run
+from apex_ompl.ompl.setup import PlanningSetup, assemble
+from apex_ompl.ompl.tuned import TUNED
+from apex_ompl.paths.path import resample
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.scene.problem import Problem
+from apex_ompl.timing import Trajectory
+from apex_ompl.timing.duration import DurationOptimizer
+from apex_ompl.timing.timed_spline import TimedSpline
+from apex_ompl.types import Array
+from benchmarks.timing.motion_figures import motion_fault
+from benchmarks.timing.motion_rows import lower_bound
+
+MARGINS = (0.005, 0.001, 0.0002)  # least clearance of the optimizer [m]
+REPAIRS = 2
+CLOSE = 1.0005  # of the lower bound: it counts as reached
+STATES = 129  # of the best motion, where it is moved
+SPREADS = (0.3, 0.6, 1.0)  # of random states around the straight line [rad]
+SHIFTS = (0.05, 0.8)  # least and largest size of a random movement of the best motion [rad]
+ATTEMPTS = 100  # for a random free state
+PLAN_TIMEOUT = 5.0  # [s]
+FURTHER = 1000  # first seed of the plans, after the one of the run
+WARM_UP, WARM_UP_SECONDS = "warm-up", 0.5
+
+
+class MotionSearch:
+    """Search for the fastest motion of a problem.
+
+    Attributes:
+        best: Fastest proved motion, or None.
+        how: Kind of the path and margin that gave it.
+        history: CPU time and duration of each improvement [s].
+        tried: Number of paths that were optimized, by kind.
+    """
+
+    def __init__(self, problem: Problem, setup: PlanningSetup, seed: int) -> None:
+        """Search among the obstacles of ``setup``."""
+        self.problem, self.setup, self.seed = problem, setup, seed
+        self.rng = np.random.default_rng(seed)
+        self.best: Trajectory | None = None
+        self.how = ""
+        self.history = list[tuple[float, float]]()
+        self.tried: dict[str, int] = {}
+        self._plans, self._started = 0, 0.0
+        self._optimizers = {
+            margin: DurationOptimizer(setup.checker.kernel, setup.robot.limits, margin=margin) for margin in MARGINS
+        }
+
+    def run(self, seconds: float) -> None:
+        """Search for a time of CPU [s]."""
+        self._started, bound = time.process_time(), lower_bound(self.setup)
+        kinds: dict[str, Callable[[], Array | None]] = {
+            "line": self._line, "apex": self._apex, "rrtconnect": self._rrtconnect, "one state": self._through_one,
+            "two states": self._through_two, "moved": self._moved, "led": self._led,
+        }  # fmt: skip
+        names = list(kinds)
+        kind = "line"
+        while self._spent() < seconds and not (self.best is not None and self.best.duration <= CLOSE * bound):
+            path = kinds[kind]()
+            if path is not None:
+                self.tried[kind] = self.tried.get(kind, 0) + 1
+                for margin in MARGINS if kind in ("line", "apex") else (float(self.rng.choice(MARGINS)),):
+                    self._optimize(path, kind, margin)
+            kind = names[1 + sum(self.tried.values()) % 2] if not self.best else str(self.rng.choice(names[1:]))
+
+    def _spent(self) -> float:
+        return time.process_time() - self._started
+
+    def _optimize(self, path: Array, kind: str, margin: float) -> None:
+        optimizer = self._optimizers[margin]
+        spline: TimedSpline | None = optimizer.fastest(path)
+        for turn in range(1, REPAIRS + 2):
+            if spline is None:
+                return
+            if self._keep(spline.trajectory(self.setup.robot.joint_names), f"{kind}, {1e3 * margin:g} mm"):
+                return
+            spline = optimizer.cleared(spline, turn) if turn <= REPAIRS else None
+
+    def _keep(self, motion: Trajectory, how: str) -> bool:
+        """Keep a motion that is faster than the best, and return whether it needs no repair."""
+        if self.best is not None and motion.duration >= self.best.duration:
+            return True
+        if motion_fault(self.setup, motion, self.setup.robot.limits):
+            return False
+        self.best, self.how = motion, how
+        self.history.append((self._spent(), motion.duration))
+        return True
+
+    def _goal(self) -> Array:
+        return np.asarray(self.rng.choice(self.setup.valid_goals))
+
+    def _line(self) -> Array:
+        return np.stack([self.setup.start, self._goal()])
+
+    def _plan_seed(self) -> int:
+        self._plans += 1
+        return self.seed if self._plans == 1 else FURTHER * (self.seed + 1) + self._plans
+
+    def _apex(self) -> Array | None:
+        result = plan(self.problem, "apex", timeout=PLAN_TIMEOUT, seed=self._plan_seed())
+        if result.trajectory is not None:
+            self._keep(result.trajectory, "apex, as planned")
+        return None if result.path is None else result.path.states
+
+    def _rrtconnect(self) -> Array | None:
+        params, seed = TUNED["rrtconnect"], self._plan_seed()
+        result = plan(self.problem, "rrtconnect", params=params, timeout=PLAN_TIMEOUT, seed=seed, timing=False)
+        return None if result.path is None else result.path.states
+
+    def _free_state(self, around: Array) -> Array | None:
+        limits, spread = self.setup.robot.limits, float(self.rng.choice(SPREADS))
+        for _ in range(ATTEMPTS):
+            q = np.clip(around + self.rng.normal(0.0, spread, around.shape), limits.lower, limits.upper)
+            if self.setup.checker.is_free(q):
+                return np.asarray(q)
+        return None
+
+    def _through(self, shares: Array) -> Array | None:
+        start, goal = self._line()
+        states = [self._free_state(start + share * (goal - start)) for share in np.sort(shares)]
+        inner = [q for q in states if q is not None]
+        return np.stack([start, *inner, goal]) if len(inner) == len(states) else None
+
+    def _through_one(self) -> Array | None:
+        return self._through(self.rng.uniform(0.2, 0.8, 1))
+
+    def _through_two(self) -> Array | None:
+        return self._through(self.rng.uniform(0.1, 0.9, 2))
+
+    def _moved(self) -> Array | None:
+        """Return the best motion's path, moved by a smooth bump in random joints."""
+        if self.best is None:
+            return None
+        states = resample(self.best(np.linspace(0.0, self.best.duration, STATES)), STATES)
+        s = np.linspace(0.0, 1.0, STATES)
+        bump = 4.0 * s * (1.0 - s) * np.exp(-(((s - self.rng.random()) / self.rng.uniform(0.1, 0.5)) ** 2))
+        size = np.exp(self.rng.uniform(*np.log(SHIFTS)))
+        limits, change = self.setup.robot.limits, self.rng.normal(0.0, size, states.shape[1])
+        return np.clip(states + bump[:, None] * change, limits.lower, limits.upper)
+
+    def _led(self) -> Array | None:
+        """Return the best motion's path with a random free state in place of a stretch."""
+        if self.best is None:
+            return None
+        states = self.best(np.linspace(0.0, self.best.duration, STATES))
+        states[0], states[-1] = self.best.positions[0], self.best.positions[-1]
+        first = int(self.rng.integers(0, STATES - 2))
+        last = int(self.rng.integers(first + 2, STATES))
+        q = self._free_state(states[(first + last) // 2])
+        return None if q is None else np.concatenate([states[: first + 1], q[None], states[last:]])
+
+
+def search(job: Job) -> Run:
+    """Return a run of the search; its parameter is the CPU time, ``seconds``."""
+    problem = load_problem(job.problem)
+    setup = assemble(problem, robot(), job.seed)
+    one = MotionSearch(problem, setup, job.seed)
+    one.run(WARM_UP_SECONDS if job.experiment == WARM_UP else float(job.params["seconds"]))
+    found: Run = {"solved": one.best is not None, "direct": lower_bound(setup), "tried": one.tried, "fault": ""}
+    if one.best is None:
+        return found
+    return found | {"duration": one.best.duration, "how": one.how, "history": one.history}
