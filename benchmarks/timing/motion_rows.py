@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -44,6 +44,7 @@ from benchmarks.timing.motion_figures import motion_fault, smoothness, torque_us
 
 SUFFIXES = (".npz", ".csv", ".traj.yaml", ".traj.json")  # of saved motions
 DENSE = 1e-3  # spacing of the states of a followed motion that are checked [rad, max-norm]
+CALLS = 2  # equal ones, of which the cheaper counts
 SEEDS = 8  # of a problem whose goal has many states
 SMOOTH_FROM = 1.0  # shortest duration of motions whose smoothness counts [s]
 PAYLOADS = (0.0, 2.0)  # in each hand [kg]
@@ -79,21 +80,32 @@ class Call:
     """A call of ``plan``: its result, its cost, and the part of that for the motion."""
 
     result: PlanResult
-    whole: Cost = field(default_factory=Cost)
-    motion: Cost = field(default_factory=Cost)
+    whole: Cost
+    motion: Cost
 
 
-def called(problem: Problem, planner: str, **options: Any) -> Call:
-    """Plan a problem, and measure the call and its last step, in which the motion is made."""
-    whole, motion, step = Cost(), Cost(), steps.time
+def called(problem: Problem, planner: str, calls: int = 1, **options: Any) -> Call:
+    """Plan a problem, and measure the call and its last step, in which the motion is made.
 
-    def timed_step(*given: Any) -> PlanResult:
-        with measured(motion):
-            return step(*given)
+    Args:
+        problem: The problem.
+        planner: Name of the planner.
+        calls: Number of equal calls; the one with the least CPU time counts, since the first one in a process makes
+            what others reuse, such as covers of meshes.
+        **options: Options of ``plan``.
+    """
+    made = list[Call]()
+    for _ in range(calls):
+        whole, motion, step = Cost(), Cost(), steps.time
 
-    with mock.patch.object(steps, "time", timed_step), measured(whole):
-        result = plan(problem, planner, **options)
-    return Call(result, whole, motion)
+        def timed_step(*given: Any, cost: Cost = motion, step: Any = step) -> PlanResult:
+            with measured(cost):
+                return step(*given)
+
+        with mock.patch.object(steps, "time", timed_step), measured(whole):
+            result = plan(problem, planner, **options)
+        made.append(Call(result, whole, motion))
+    return min(made, key=lambda call: call.whole.cpu)
 
 
 def lower_bound(setup: PlanningSetup) -> float:
@@ -126,8 +138,9 @@ def by_plan(job: Job) -> Run:
     problem = load_problem(job.problem)
     params = TUNED.get(job.planner) if job.planner != "apex" else None
     call = called(
-        problem, job.planner, params=params, timeout=job.timeout, seed=job.seed, objective=objective, timing=timing
-    )
+        problem, job.planner, CALLS, params=params, timeout=job.timeout, seed=job.seed, objective=objective,
+        timing=timing,
+    )  # fmt: skip
     return columns_of(call, assemble(problem, robot(), job.seed), timing)
 
 
@@ -180,7 +193,7 @@ def shortened_path(job: Job) -> tuple[Problem, PlanningSetup, Call]:
     """Return the problem and the path of tuned rrtconnect, shortened by OMPL, without a motion."""
     problem = load_problem(job.problem)
     call = called(
-        problem, "rrtconnect", params=TUNED["rrtconnect"], timeout=job.timeout, seed=job.seed, timing=False
+        problem, "rrtconnect", CALLS, params=TUNED["rrtconnect"], timeout=job.timeout, seed=job.seed, timing=False
     )
     return problem, assemble(problem, robot(), job.seed), call
 
