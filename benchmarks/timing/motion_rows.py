@@ -52,6 +52,7 @@ SPACINGS = (np.inf, 0.4, 0.2, 0.1, 0.05)  # of the points of TOPP-RA's spline be
 LEAST_POINTS = 2  # of a segment
 SAMPLING = 0.002  # of rivals' motions for the full check [s]
 ARMS = "arms"  # RoboPlan's group of their joints
+ROBOPLAN_ERRORS = (RuntimeError, IndexError)
 DT = 0.01  # of RoboPlan's motion, its default [s]
 FIRST_OBJECTS = ("lower", "cup", "block")  # of the suites of aligned objects
 
@@ -311,7 +312,7 @@ def by_roboplan(job: Job) -> Run:
             found = planner.plan(start, goal)
             shortcuts = PathShortcuttingOptions(max_step_size=SEARCH_RESOLUTION, seed=job.seed)
             short = PathShortcutter(scene, shortcuts).shortcut(found)
-    except RuntimeError as error:
+    except ROBOPLAN_ERRORS as error:
         return {"solved": False, "reason": str(error)[:80], "cpu": cost.cpu, "total": cost.wall}
     states = np.array(short.positions)[:, [names.index(joint) for joint in machine.joint_names]]
     path = JointPath()
@@ -322,7 +323,7 @@ def by_roboplan(job: Job) -> Run:
     def motion(mode: Any) -> tuple[Array, float] | None:
         try:
             made = timer.generate(path, TOPPRAOptions(dt=DT, mode=mode))
-        except RuntimeError:
+        except ROBOPLAN_ERRORS:
             return None
         return with_hands(np.array(made.positions), arms, states, machine.joint_names), float(made.times[-1])
 
