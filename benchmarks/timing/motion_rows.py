@@ -190,13 +190,13 @@ def by_seeds(job: Job) -> Run:
             "cpu": float(np.median(costs))}  # fmt: skip
 
 
-def shortened_path(job: Job) -> tuple[Problem, PlanningSetup, Call]:
-    """Return the problem and the path of tuned rrtconnect, shortened by OMPL, without a motion."""
+def shortened_path(job: Job) -> tuple[PlanningSetup, Call]:
+    """Return the set-up of a problem, and the call of tuned rrtconnect, whose path OMPL shortens, without a motion."""
     problem = load_problem(job.problem)
     call = called(
         problem, "rrtconnect", CALLS, params=TUNED["rrtconnect"], timeout=job.timeout, seed=job.seed, timing=False
     )
-    return problem, assemble(problem, robot(), job.seed), call
+    return assemble(problem, robot(), job.seed), call
 
 
 def fastest_valid(
@@ -243,9 +243,9 @@ def by_toppra(job: Job) -> Run:
     from benchmarks.timing.timing_methods import optimum
 
     toppra.setup_logging("ERROR")
-    _, setup, call = shortened_path(job)
+    setup, call = shortened_path(job)
     path = call.result.path
-    if path is None:
+    if path is None or not call.result:
         return {"solved": False, "reason": call.result.reason, "cpu": call.whole.cpu, "total": call.whole.wall}
 
     with quiet_ompl():

@@ -134,12 +134,12 @@ class MotionSearch:
         result = plan(self.problem, "apex", timeout=PLAN_TIMEOUT, seed=self._plan_seed())
         if result.trajectory is not None:
             self._keep(result.trajectory, "apex, as planned")
-        return None if result.path is None else result.path.states
+        return result.path.states if result and result.path is not None else None
 
     def _rrtconnect(self) -> Array | None:
         params, seed = TUNED["rrtconnect"], self._plan_seed()
         result = plan(self.problem, "rrtconnect", params=params, timeout=PLAN_TIMEOUT, seed=seed, timing=False)
-        return None if result.path is None else result.path.states
+        return result.path.states if result and result.path is not None else None
 
     def _free_state(self, around: Array) -> Array | None:
         limits, spread = self.setup.robot.limits, float(self.rng.choice(SPREADS))
