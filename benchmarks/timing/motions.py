@@ -174,7 +174,7 @@ def duration_row(group: str, label: str, runs: Sequence[Run], best: Mapping[str,
     costs = [run["cpu"] / length[name]["cpu"] for name, run in both.items()]
     slower = sum(share > 1.0 + 1e-9 for share in shares)
     return [
-        group, label, len(mine), len(solved), sum(bool(run["fault"]) for run in mine.values()),
+        group, label, len(mine), len(solved), sum(bool(run.get("fault")) for run in mine.values()),
         *cells([run["duration"] / run["direct"] for run in solved.values()], (50, 95)),
         *cells([run["duration"] / best[name] for name, run in solved.items()], (50, 95)),
         *cells(shares, (50, 95)), slower, *cells([run["cpu"] for run in solved.values()], (50, 95), 1e3, 0),
@@ -209,7 +209,9 @@ def durations(runs: Runs, levels: Sequence[str], args: argparse.Namespace) -> tu
     head = ["problem", "what the search found it by", "time / best known", "time s", "best known s"]
     text = [table(DURATION_HEAD, lines), f"Where `time` takes more than {WEAK:g} of the best known:"]
     text += [table(head, weak_rows)] + [f"Without rows of {name}, which is not installed." for name in missing]
-    faults = [f"{run['problem']}, {run['label']}, seed {run['seed']}: {run['fault']}" for run in made if run["fault"]]
+    faults = [
+        f"{run['problem']}, {run['label']}, seed {run['seed']}: {run['fault']}" for run in made if run.get("fault")
+    ]
     data = {"rows": [dict(zip(DURATION_HEAD, line, strict=True)) for line in lines], "best": best, "faults": faults}
     data["weak"] = [dict(zip(head, row, strict=True)) for row in weak_rows]
     return data, "\n\n".join(text + (["Faults:", *faults] if faults else []))
@@ -246,16 +248,17 @@ def goals(runs: Runs, levels: Sequence[str], args: argparse.Namespace) -> tuple[
 def goal_row(kind: str, objective: str, by: Mapping[str, Mapping[str, Run]]) -> list[Any]:
     """Return the row of a table for an objective; ``by`` has the runs by objective and problem."""
     own, all_rows, solved = list[float](), list[float](), 0
-    for name, run in by[objective].items():
+    mine = [run for run in by[objective].values() if "durations" in run]
+    for run in mine:
         found = np.array([d for d in run["durations"] if d is not None])
-        least = min((d for some in by.values() for d in some[name]["durations"] if d is not None), default=math.nan)
+        there = [some[run["problem"]].get("durations", ()) for some in by.values()]
+        least = min((d for one in there for d in one if d is not None), default=math.nan)
         solved += len(found)
         own += (found / found.min()).tolist() if len(found) else []
         all_rows += (found / least).tolist()
-    mine = by[objective].values()
     return [
-        kind, objective, len(mine), f"{solved / max(SEEDS * len(mine), 1):.3f}",
-        sum(bool(run["fault"]) for run in mine), *cells(own, (50, 95)), *cells(all_rows, (50, 95)),
+        kind, objective, len(by[objective]), f"{solved / max(SEEDS * len(by[objective]), 1):.3f}",
+        sum(bool(run.get("fault")) for run in mine), *cells(own, (50, 95)), *cells(all_rows, (50, 95)),
         *cells([run["cpu"] for run in mine], (50,), 1e3, 0),
     ]  # fmt: skip
 

@@ -152,6 +152,23 @@ def test_rows_make_runs_for_tables(rows: ModuleType) -> None:
     line = motions.duration_row("hard", "time", runs, best)
     assert len(line) == len(motions.DURATION_HEAD) and line[2:5] == [1, 1, 0]
     assert best[PROBLEM] == min(run["duration"] for run in runs)
+    crashed = {**about, "problem": "wall/easy/800001", "solved": False, "status": "CRASH"}
+    assert motions.duration_row("hard", "time", [*runs, crashed], best)[2:5] == [2, 1, 0]
+
+
+def test_the_best_of_several_seeds_is_the_reference() -> None:
+    motions = benchmark_script("timing.motions")
+    runs = {
+        "length": {"a": {"problem": "a", "durations": [2.0, 4.0], "cpu": 0.01}},
+        "time": {
+            "a": {"problem": "a", "durations": [1.0, None, 1.5], "cpu": 0.02, "fault": "x"},
+            "b": {"problem": "b", "solved": False},
+        },
+    }
+    runs["length"]["b"] = {"problem": "b", "durations": [3.0], "cpu": 0.01}
+    kind, row, n, solved, faults, own, _, every, *_ = motions.goal_row("pose", "time", runs)
+    assert (kind, row, n, solved, faults) == ("pose", "time", 2, "0.125", 1) and own == every == "1.250"
+    assert motions.goal_row("pose", "length", runs)[7] == "2.000"
 
 
 def test_the_search_is_at_least_as_fast_as_the_plan(rows: ModuleType) -> None:
