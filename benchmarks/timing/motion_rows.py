@@ -21,6 +21,7 @@ import yaml
 from ompl import geometric as og
 
 from apex_ompl import load_problem, plan
+from apex_ompl.errors import ParameterError
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.goals.pose_goal import PoseGoal
@@ -379,8 +380,9 @@ def by_export(job: Job) -> Run:
     """Return how motions fare that are saved, read back and followed as a controller does it.
 
     For each way to save, ``exports`` has the largest use of velocity, acceleration and jerk limits, whether a state of
-    the followed motion collides, its distance from the start and the goal [rad], the size of the file, and its points.
-    Parameters are the ``objective`` and the rates, ``rates``; 0 stands for the motion's own knots.
+    the followed motion collides, its distance from the start and the goal [rad], the size of the file, and its points;
+    ``refused`` is why a rate is too low, and ``unreadable`` why a file cannot be followed. Parameters are the
+    ``objective`` and the rates, ``rates``; 0 stands for the motion's own knots.
     """
     problem = load_problem(job.problem)
     call = called(problem, job.planner, timeout=job.timeout, seed=job.seed, objective=job.params["objective"])
@@ -393,13 +395,17 @@ def by_export(job: Job) -> Run:
         for rate in job.params["rates"]:
             for suffix in SUFFIXES:
                 file = Path(folder) / f"motion{suffix}"
-                motion.save(file, **({"rate": rate} if rate else {}))
+                try:
+                    motion.save(file, **({"rate": rate, "limits": setup.robot.limits} if rate else {}))
+                except ParameterError as error:  # a rate too low for the motion
+                    exports[f"{suffix} {rate:g}"] = {"refused": str(error)}
+                    continue
                 exports[f"{suffix} {rate:g}"] = export_figures(file, setup)
     return found | {"duration": motion.duration, "exports": exports}
 
 
 def export_figures(file: Path, setup: PlanningSetup) -> dict[str, Any]:
-    """Return the figures of a saved motion, see :func:`by_export`; ``unreadable`` is why it cannot be followed."""
+    """Return the figures of a saved motion, see :func:`by_export`."""
     limits, size = setup.robot.limits, file.stat().st_size
     try:
         points = read_points(file)

@@ -52,6 +52,7 @@ WITHIN = 1.001  # of a limit, for saved motions
 ELSEWHERE = 1e-6  # distance from start or goal, or speed at the ends, for saved motions [rad, rad/s]
 WEAK = 1.07  # of the best known duration
 RATES = (100.0, 1000.0)  # at which motions are saved besides their own knots [Hz]
+HANDS = ("left_hand", "right_hand")
 MODULE = "benchmarks.timing.motion_rows"
 
 SCENES = ("shelf", "bins", "cage", "posts", "wall", "swap", "clutter")
@@ -283,10 +284,15 @@ def smoothness(runs: Runs, levels: Sequence[str], args: argparse.Namespace) -> t
 
 def torque(runs: Runs, levels: Sequence[str], args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     """Return the largest share of the torque limits, without a payload and with one."""
+    known = {field.name for field in fields(Timing)}
     rows = list(OWN)
-    if "torque" in {field.name for field in fields(Timing)}:
-        params = {"objective": "time", "timing.torque": True}
-        rows.append(Row("time, torque", "apex", params, runner=f"{MODULE}:by_plan"))
+    if "payload" in known:
+        for payload in PAYLOADS:
+            params = {"objective": "time", "timing.payload": dict.fromkeys(HANDS, payload)}
+            rows.append(Row(f"time, {payload:g} kg given", "apex", params, runner=f"{MODULE}:by_plan"))
+    if "torque_limits" in known:
+        params = {"objective": "time", "timing.torque_limits": False}
+        rows.append(Row("time, no torque limits", "apex", params, runner=f"{MODULE}:by_plan"))
     made, lines = runs.of(rows, levels, args.n), []
     for row in rows:
         mine = [run for run in by_problem(made, row.label).values() if run["solved"]]
@@ -313,7 +319,16 @@ def export(runs: Runs, levels: Sequence[str], args: argparse.Namespace) -> tuple
         saved = [run["exports"] for run in made if run["label"] == row.label and run["solved"]]
         for key in saved[0] if saved else ():
             lines.append(export_row(row.label, key, [one[key] for one in saved]))
-    head = ["row", "format and rate", "motions", "unreadable", "over the velocity", "acceleration", "jerk limit"]
+    head = [
+        "row",
+        "format and rate",
+        "motions",
+        "refused",
+        "unreadable",
+        "over the velocity",
+        "acceleration",
+        "jerk limit",
+    ]
     head += ["largest use", "in collision", "end elsewhere", "points p50", "kB p50", "most"]
     about = f"A limit counts as exceeded over {WITHIN:g} of it. Rate 0: the motion's own knots."
     return {"rows": [dict(zip(head, line, strict=True)) for line in lines]}, f"{table(head, lines)}\n\n{about}"
@@ -321,12 +336,14 @@ def export(runs: Runs, levels: Sequence[str], args: argparse.Namespace) -> tuple
 
 def export_row(label: str, key: str, saved: Sequence[Mapping[str, Any]]) -> list[Any]:
     """Return the row of a table for a way to save."""
-    read = [one for one in saved if "unreadable" not in one]
+    written = [one for one in saved if "refused" not in one]
+    read = [one for one in written if "unreadable" not in one]
     use = np.array([one["use"] for one in read]).reshape(-1, 3)
     off = sum(one["off"] > ELSEWHERE or one["moving"] > ELSEWHERE for one in read)
-    sizes = [one["bytes"] / 1e3 for one in saved]
+    sizes = [one["bytes"] / 1e3 for one in written]
     return [
-        label, key, len(saved), len(saved) - len(read), *(use > WITHIN).sum(axis=0).tolist(),
+        label, key, len(saved), len(saved) - len(written), len(written) - len(read),
+        *(use > WITHIN).sum(axis=0).tolist(),
         f"{use.max():.6g}" if len(use) else "-", sum(one["collides"] for one in read), off,
         *cells([one["points"] for one in read], (50,), digits=0), *cells(sizes, (50, 100), digits=0),
     ]  # fmt: skip

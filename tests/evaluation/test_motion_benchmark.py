@@ -184,8 +184,9 @@ def test_saved_motions_are_followed(rows: ModuleType) -> None:
     for one in made["exports"].values():
         assert max(one["use"]) < 1.001 and not one["collides"] and one["off"] < 1e-6 and one["moving"] < 1e-6
     motions = benchmark_script("timing.motions")
-    line = motions.export_row("time", ".csv 0", [made["exports"][".csv 0"]])
-    assert line[2:7] == [1, 0, 0, 0, 0] and line[8:10] == [0, 0]
+    others = [{"refused": "too low"}, {"unreadable": "no", "bytes": 10}]
+    line = motions.export_row("time", ".csv 0", [made["exports"][".csv 0"], *others])
+    assert line[2:8] == [3, 1, 1, 0, 0, 0] and line[9:11] == [0, 0]
 
 
 def test_hands_follow_the_arms_along_the_path(rows: ModuleType) -> None:
