@@ -17,6 +17,7 @@ from unittest import mock
 
 import numpy as np
 import pinocchio as pin
+import ruckig
 import yaml
 from ompl import geometric as og
 
@@ -36,8 +37,8 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Alignment, Goal, PoseTarget, Problem
-from apex_ompl.timing import Timing
-from apex_ompl.timing.duration import direct_durations
+from apex_ompl.timing import Timing, Trajectory
+from apex_ompl.timing.ruckig_method import calculate, knots
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline
 from benchmarks.timing.exported_motions import followed, largest, read_points
@@ -112,7 +113,20 @@ def called(problem: Problem, planner: str, calls: int = 1, **options: Any) -> Ca
 
 def lower_bound(setup: PlanningSetup) -> float:
     """Return the least duration of a motion to any goal of a problem, obstacles ignored [s]."""
-    return float(direct_durations(setup.start, setup.valid_goals, setup.robot.limits).min())
+    return min(direct_motion(setup, goal).duration for goal in setup.valid_goals)
+
+
+def direct_motion(setup: PlanningSetup, goal: Array) -> Trajectory:
+    """Return Ruckig's motion from the start to a goal, all joints at rest at both ends and in the same time."""
+    limits, solver, task = setup.robot.limits, ruckig.Ruckig(setup.robot.dof), ruckig.InputParameter(setup.robot.dof)
+    for name in ("velocity", "acceleration", "jerk"):
+        setattr(task, f"max_{name}", getattr(limits, name).tolist())
+    task.current_position, task.target_position = setup.start.tolist(), goal.tolist()
+    made = ruckig.Trajectory(setup.robot.dof)
+    calculate(solver, task, made)
+    times, positions, velocities, accelerations = knots(made)
+    positions[0], positions[-1] = setup.start, goal  # without rounding
+    return Trajectory(times, positions, velocities, accelerations, setup.robot.joint_names)
 
 
 def columns_of(call: Call, setup: PlanningSetup, timing: Timing) -> Run:

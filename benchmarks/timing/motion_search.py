@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-import ruckig
 
 from apex_ompl import load_problem, plan
 from apex_ompl.evaluation.rows import Job
@@ -26,11 +25,10 @@ from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.duration import DurationOptimizer
-from apex_ompl.timing.ruckig_method import calculate, knots
 from apex_ompl.timing.timed_spline import TimedSpline
 from apex_ompl.types import Array
 from benchmarks.timing.motion_figures import motion_fault
-from benchmarks.timing.motion_rows import lower_bound
+from benchmarks.timing.motion_rows import direct_motion, lower_bound
 
 MARGINS = (0.005, 0.001, 0.0002)  # least clearance of the optimizer [m]
 FINER = (4, 2)  # multiples of the number of knots with which an improvement is optimized again, until one is proved
@@ -182,19 +180,6 @@ class MotionSearch:
         last = int(self.rng.integers(first + 2, STATES))
         q = self._free_state(states[(first + last) // 2])
         return None if q is None else np.concatenate([states[: first + 1], q[None], states[last:]])
-
-
-def direct_motion(setup: PlanningSetup, goal: Array) -> Trajectory:
-    """Return Ruckig's motion from the start to a goal, all joints at rest at both ends and in the same time."""
-    limits, solver, task = setup.robot.limits, ruckig.Ruckig(setup.robot.dof), ruckig.InputParameter(setup.robot.dof)
-    for name in ("velocity", "acceleration", "jerk"):
-        setattr(task, f"max_{name}", getattr(limits, name).tolist())
-    task.current_position, task.target_position = setup.start.tolist(), goal.tolist()
-    made = ruckig.Trajectory(setup.robot.dof)
-    calculate(solver, task, made)
-    times, positions, velocities, accelerations = knots(made)
-    positions[0], positions[-1] = setup.start, goal  # without rounding
-    return Trajectory(times, positions, velocities, accelerations, setup.robot.joint_names)
 
 
 def search(job: Job) -> Run:
