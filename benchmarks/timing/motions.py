@@ -287,7 +287,7 @@ def torque(runs: Runs, levels: Sequence[str], args: argparse.Namespace) -> tuple
     known = {field.name for field in fields(Timing)}
     rows = list(OWN)
     if "payload" in known:
-        for payload in PAYLOADS:
+        for payload in filter(None, PAYLOADS):
             params = {"objective": "time", "timing.payload": dict.fromkeys(HANDS, payload)}
             rows.append(Row(f"time, {payload:g} kg given", "apex", params, runner=f"{MODULE}:by_plan"))
     if "torque_limits" in known:
