@@ -8,6 +8,7 @@ back to the goal, and kept where they are free and nearer.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
@@ -41,7 +42,7 @@ CLEARING_ROUNDS = 12  # of random search for a free state
 CHILDREN = 16  # states of a round of random search
 MOST_ROUNDS = 20  # of random search
 LOWER, PATIENCE = 0.99, 5  # ratio of costs, and rounds after which it ends without one lower by it
-LOG_SPREADS = np.log(0.02), np.log(0.3)  # of the standard deviation of perturbations, as a share of the joints' reach
+LOG_SPREADS = math.log(0.02), math.log(0.3)  # of the standard deviation of perturbations, as a share of reaches
 ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares of it
 DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
 SHORTEST = 0.05  # least duration for which the reach is computed [s]
@@ -291,7 +292,7 @@ class _Search:
         """Return states of the goal around others, shape (N, dof), up to a share ``pull`` of the way to the start."""
         rng, free = self.rng, self.goal.inverse.free
         children = parents[rng.integers(len(parents), size=CHILDREN)]
-        spread = np.exp(rng.uniform(*LOG_SPREADS, size=(CHILDREN, 1)))
+        spread = np.array([[math.exp(one)] for one in rng.uniform(*LOG_SPREADS, size=CHILDREN).tolist()])
         change = spread * self._reach(parents) * rng.normal(size=children.shape)
         change += pull * rng.random((CHILDREN, 1)) * (self.start - children)
         children[:, free] += change[:, free]

@@ -10,6 +10,7 @@ from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.compiled.timing import duration_optimization as compiled
 from apex_ompl.kernel.compiled.timing.duration_optimization import DurationSettings
 from apex_ompl.kernel.kernel import Kernel
+from apex_ompl.kernel.products import product
 from apex_ompl.types import Array
 
 __all__ = ["DurationReport", "DurationSettings", "TimeGrid", "lower_duration"]
@@ -41,7 +42,7 @@ class TimeGrid(NamedTuple):
         """
         spans = points - WIDTH + 1
         first = np.repeat(np.arange(spans, dtype=np.int64), samples)
-        mass, block = np.zeros((points, WIDTH)), basis.T @ basis
+        mass, block = np.zeros((points, WIDTH)), product(basis.T, basis)
         for k in range(spans):
             for m in range(WIDTH):
                 mass[k + m, : WIDTH - m] += block[m, m:]

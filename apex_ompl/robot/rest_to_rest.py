@@ -7,6 +7,8 @@ T = (32 d/j)^(1/3); where v < a^2/j, v is reached without a: T = d/v + 2 sqrt(v/
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from apex_ompl.robot.model import Limits
@@ -24,10 +26,11 @@ def direct_durations(start: Array, goals: Array, limits: Limits) -> Array:
     d, (v, a, j) = np.abs(goals - start), (limits.velocity, limits.acceleration, limits.jerk)
     ramp, ramps = a / j, _ramps(limits)
     ramped = np.where((v >= a * ramp) & (d >= 2.0 * a * ramp**2), ramp + np.sqrt(ramp**2 + 4.0 / a * d), 0.0)
-    durations: Array = np.where(
-        d >= 2.0 * v * ramps, d / v + 2.0 * ramps, np.where(ramped > 0.0, ramped, np.cbrt(32.0 / j * d))
-    ).max(axis=1)
-    return durations
+    durations: Array = np.where(d >= 2.0 * v * ramps, d / v + 2.0 * ramps, ramped)
+    jerky = durations == 0.0
+    durations[jerky] = [math.cbrt(cube) for cube in (32.0 / j * d)[jerky].tolist()]  # the same bits everywhere
+    longest: Array = durations.max(axis=1)
+    return longest
 
 
 def direct_reach(duration: float, limits: Limits) -> Array:

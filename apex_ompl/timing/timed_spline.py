@@ -104,7 +104,7 @@ class TimedSpline(NamedTuple):
         x = at - span
         points = self.control[span[:, None] + np.arange(PINNED + 1)]
         weights = basis(x) - (spacing / self.spacing) ** 2 / 6.0 * curvatures(x)
-        control = np.einsum("nk,nkd->nd", weights, points)
+        control = (weights[:, :, None] * points).sum(axis=1)
         control[:PINNED], control[-PINNED:] = self.start.position, self.control[-1]
         return TimedSpline(control, float(spacing), self.start)
 
@@ -118,7 +118,9 @@ class TimedSpline(NamedTuple):
 
 def basis(x: Array) -> Array:
     """Return the weights of the four control points of a span at shares of it, shape (N, 4)."""
-    return np.stack([(1 - x) ** 3, 3 * x**3 - 6 * x**2 + 4, -3 * x**3 + 3 * x**2 + 3 * x + 1, x**3], axis=1) / 6.0
+    square, rest = x * x, 1 - x
+    cube = square * x  # powers of NumPy differ between processors
+    return np.stack([rest * rest * rest, 3 * cube - 6 * square + 4, -3 * cube + 3 * square + 3 * x + 1, cube], 1) / 6.0
 
 
 def slopes(x: Array) -> Array:

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("quiet")
 
 
 def test_it_is_the_default_and_proves_what_it_finds() -> None:
-    result = plan(cached_problem(HARD), timeout=20.0)
+    result = plan(cached_problem(HARD), timeout=20.0, objective="length")
     assert result and result.planner == "apex", result.reason
     checker = assemble(cached_problem(HARD), robot()).checker
     assert full_check(checker, result.path, result.path[0], [result.path[-1]])
@@ -38,7 +38,7 @@ def test_it_is_the_default_and_proves_what_it_finds() -> None:
     assert 0.0 < inside.pop("first") < result.times["solve"]
     assert {"query", "known", "polish"} <= inside.keys()
     assert sum(inside.values()) <= result.times["solve"]
-    tree = plan(cached_problem(HARD), "rrtconnect", timeout=20.0)
+    tree = plan(cached_problem(HARD), "rrtconnect", timeout=20.0, objective="length")
     assert result.length < tree.length
 
 

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -70,7 +71,7 @@ def test_all_functions_that_python_calls_are_listed_with_types_that_fit_their_an
                 found[f"{module}.{node.name}"] = [ast.unparse(a.annotation) for a in node.args.args if a.annotation]
     assert found.keys() == ALL.keys()
     for name, hints in found.items():
-        text = ALL[name][0].replace("Tuple((f8, f8, f8, f8, f8, f8, i8))", "Numbers").replace("[:, ", "[")
+        text = re.sub(r"Tuple\(\((?:f8, )+i8\)\)", "Numbers", ALL[name][0]).replace("[:, ", "[")
         types = [one.strip() for one in text.replace(":, ", "").split(",") if one.strip()]
         for hint, one in zip(hints, types, strict=True):
             wanted = kinds.get(hint, hint)

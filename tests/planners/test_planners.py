@@ -120,9 +120,9 @@ def test_every_planner_solves_the_robots_problem(name: str, problem: Problem) ->
 @pytest.mark.parametrize("name", ["shelf/medium/800005", "swap/medium/800002"])
 def test_polish_shortens_what_rrtconnect_finds(name: str) -> None:
     """The same trees, a shorter path that passes the full check, and smooth: it turns by little at each state."""
-    plain = plan(name, "rrtconnect", timeout=30.0, seed=3)
-    polished = plan(name, "rrtconnect+polish", timeout=30.0, seed=3)
-    again = plan(name, "rrtconnect+polish", timeout=30.0, seed=3)
+    plain = plan(name, "rrtconnect", timeout=30.0, seed=3, objective="length")
+    polished = plan(name, "rrtconnect+polish", timeout=30.0, seed=3, objective="length")
+    again = plan(name, "rrtconnect+polish", timeout=30.0, seed=3, objective="length")
     assert plain and polished and polished.solved_by == "rrtconnect+polish"
     assert polished.length < plain.length and polished.clearance > plain.clearance
     assert np.array_equal(polished.path, again.path)
@@ -130,7 +130,8 @@ def test_polish_shortens_what_rrtconnect_finds(name: str) -> None:
     steps = np.diff(polished.path, axis=0)
     turns = np.linalg.norm(np.diff(steps, axis=0), axis=1) / np.linalg.norm(steps, axis=1).mean()
     assert len(polished.path) == 256 and turns.max() < 0.5
-    few = plan(name, "rrtconnect+polish", timeout=30.0, seed=3, params={"control_points": 20, "pinned": 3})
+    shape = {"control_points": 20, "pinned": 3}
+    few = plan(name, "rrtconnect+polish", timeout=30.0, seed=3, params=shape, objective="length")
     assert few and np.abs(np.diff(few.path, axis=0)[[0, -1]]).max() < 0.01 * np.abs(np.diff(few.path, axis=0)).max()
 
 

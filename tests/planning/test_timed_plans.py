@@ -24,7 +24,7 @@ def test_plans_are_timed_and_checked() -> None:
     result = plan("ball_in_cup", timeout=20.0)
     motion = result.trajectory
     assert result and motion is not None and motion.dof == 16 and 0.3 < motion.duration < 10.0
-    assert set(result.limit_use) == {"position", "velocity", "acceleration", "jerk"}
+    assert set(result.limit_use) == {"position", "velocity", "acceleration", "jerk", "torque"}
     assert 0.9 < max(result.limit_use.values()) <= 1.0 + 1e-9 and result.deviation <= Timing().deviation
     ready = assemble(result.problem)
     states = motion.sample(0.001).position
