@@ -34,6 +34,7 @@ JERK_MARGIN = 1e-4  # share by which the jerk limit of a problem is over the jer
 JERK_FLOORS = (1e-5, 1e-4)  # added to it, times the cubed duration of the problem: tried in turn [rad]
 FLOOR_SHARE = 0.01  # largest floor, as a share of the limit
 WINDOW = 0.2  # in which a motion with fewer knots meets the given one [s]
+NUDGED, NUDGE = 1e-8, 1e-9  # Ruckig 0.19 crashes on a joint that returns at the opposite velocity [rad, rad/s]
 WIDE = 2.0  # factor on the largest velocity and acceleration of a motion, for the limits of its problems
 SAME_DURATION = 1e-6  # relative difference of durations that count as one
 CALM_TIME = 1.005  # duration of a straight motion over the shortest one, for which its jerk is the least
@@ -214,11 +215,14 @@ def calm(
     reach = largest**2 / np.min([floor.min(axis=0) for floor in floors], axis=0)  # reached at such a jerk
     query.max_velocity = (WIDE * np.abs(states[1]).max(axis=0) + limits.velocity + reach).tolist()
     rows, solved = states.tolist(), 0
+    returns = (np.abs(np.diff(states[0], axis=0)) < NUDGED) & (np.abs(states[1, 1:] + states[1, :-1]) < NUDGED)
+    targets = (states[1, 1:] + np.where(returns & (states[1, :-1] != 0.0), NUDGE, 0.0)).tolist()
     for k, length in enumerate(lengths.tolist()):
         if stop():
             return None
         query.current_position, query.current_velocity, query.current_acceleration = (values[k] for values in rows)
-        query.target_position, query.target_velocity, query.target_acceleration = (values[k + 1] for values in rows)
+        query.target_position, _, query.target_acceleration = (values[k + 1] for values in rows)
+        query.target_velocity = targets[k]
         query.minimum_duration = length
         for limit in jerks:
             query.max_jerk = limit[k]

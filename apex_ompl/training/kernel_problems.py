@@ -2,7 +2,7 @@
 
 They are written on a machine that has those (:mod:`apex_ompl.training.units`). The data engine solves them from the
 straight line and its random perturbations, and keeps the paths that the sphere cover proves free. Parts of paths are
-left out: the obstacle point at their start needs Coal. A training validates its model on some of them.
+left out: the obstacle point at their start needs Coal.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ import io
 import json
 import os
 import re
-import time
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,14 +25,9 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.arrays import GRID_ROW, SceneArrays
 from apex_ompl.kernel.tables import SceneTables, scene_fault
 from apex_ompl.model.geometry import SHAPES, ObstacleRecord
-from apex_ompl.model.proposals import Sampling, TrajectoryModel
-from apex_ompl.model.query import ObstacleSet, Query
-from apex_ompl.paths.candidates import first_valid
-from apex_ompl.paths.optimizer import Optimizer
-from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.paths.spline import Spline
 from apex_ompl.training.engine import STRATEGIES, Engine, EngineOptions, PathFinder, ProblemRecord
-from apex_ompl.training.records import Paths, held_extents
+from apex_ompl.training.records import Paths
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file, make_folder, write_atomically
 
@@ -233,52 +226,3 @@ def solve_kernel_problems(
         finder.points = {q.tobytes(): p for q, p in zip((start, goal), problem.points, strict=True)}
         engine.solve(finder, problem.record)
     return engine.paths(first.robot.name, first.robot.joint_names), engine.times
-
-
-def query_from_problem(problem: KernelProblem) -> Query:
-    """Return the model's query of a problem."""
-    obstacles = ObstacleSet.from_rows(problem.record.obstacles)
-    held = held_extents(problem.record.held)
-    return Query(problem.start, problem.goal, problem.points[0], obstacles, held=held)
-
-
-def success_rates(
-    model: TrajectoryModel, problems: Sequence[KernelProblem], count: int, *, sampling: Sampling | None = None,
-    seed: int = 0,
-) -> dict[str, float]:  # fmt: skip
-    """Return the shares of problems that a model solves.
-
-    Args:
-        model: The model.
-        problems: Problems to solve.
-        count: Number of proposals for each.
-        sampling: Parameters of sampling; by default the model's own.
-        seed: Seed of the noise; each problem has a generator of its own.
-
-    Returns:
-        Shares of the problems: ``sampled`` with a valid path among the proposals, ``repaired`` with a valid path before
-        or after optimization of the proposals, and the latter by level, ``suite/level``. ``seconds`` is the median
-        time of a problem [s].
-    """
-    optimizer = Optimizer(model.spline)
-    sampled, repaired, seconds = [], [], []
-    levels: dict[str, list[bool]] = defaultdict(list)
-    for problem in problems:
-        kernel = Kernel(problem.robot, problem.scene)
-
-        def is_valid(path: np.ndarray, kernel: Kernel = kernel) -> bool:
-            return kernel.proves(path, FINE_RESOLUTION)
-
-        started = time.perf_counter()
-        generator = np.random.default_rng(seed)
-        query = query_from_problem(problem)
-        control = model.propose(query, kernel, count, sampling=sampling, generator=generator).control
-        direct = any(is_valid(model.spline.path(points)) for points in control)
-        found = direct or first_valid(optimizer, kernel, control, is_valid) is not None
-        seconds.append(time.perf_counter() - started)
-        sampled.append(direct)
-        repaired.append(found)
-        levels[f"{problem.suite}/{problem.level}"].append(found)
-    rates = {"sampled": float(np.mean(sampled)), "repaired": float(np.mean(repaired))}
-    rates["seconds"] = float(np.median(seconds))
-    return rates | {level: float(np.mean(found)) for level, found in sorted(levels.items())}

@@ -24,10 +24,11 @@ from apex_ompl.training.autoencoder import LinearLatent, VariationalLatent
 from apex_ompl.training.conditions import Conditions
 from apex_ompl.training.config import TrainingConfig
 from apex_ompl.training.data import TrainingData
-from apex_ompl.training.kernel_problems import KernelProblem, success_rates
+from apex_ompl.training.kernel_problems import KernelProblem
 from apex_ompl.training.latent_diffusion import CollisionCost, Draws, FeaturesAlong, LatentDiffusion
 from apex_ompl.training.run import RunLog, TrainingRun
 from apex_ompl.training.torch_model import TorchModel, load_torch_model, save_model
+from apex_ompl.training.validation import success_rates
 
 NETWORKS = ("latent", "condition", "denoiser", "noise")  # parts of a model that a configuration sets
 VALIDATION_PATHS = 2048  # most held-out paths on which the validation loss is taken

@@ -19,9 +19,10 @@ from typing import Any
 
 import torch
 
-from apex_ompl.training.kernel_problems import load_kernel_problems, success_rates
+from apex_ompl.training.kernel_problems import load_kernel_problems
 from apex_ompl.training.run import read_log
 from apex_ompl.training.torch_model import load_torch_model
+from apex_ompl.training.validation import success_rates
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record

@@ -20,8 +20,9 @@ from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import FINE_RESOLUTION
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.training.kernel_problems import load_kernel_problems, query_from_problem
+from apex_ompl.training.kernel_problems import load_kernel_problems
 from apex_ompl.training.store import load
+from apex_ompl.training.validation import query_from_problem
 
 FULL = ROOT / "data" / "dual_panda_softhand"
 

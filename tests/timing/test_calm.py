@@ -16,6 +16,7 @@ from apex_ompl.timing import Timing, Trajectory, joined, ruckig_method
 from apex_ompl.timing.curve import Polyline
 from apex_ompl.timing.ruckig_method import between, calm
 from apex_ompl.timing.spline_method import blend
+from apex_ompl.timing.timed_spline import Start, TimedSpline
 
 
 def random_spline(seed: int, knots: int = 12, joints: int = 16) -> Trajectory:
@@ -224,3 +225,16 @@ def test_motions_are_joined_where_they_meet() -> None:
             whole.selected(wrong)
     with pytest.raises(ParameterError, match="other"):
         whole.deviation(part)
+
+
+def test_joints_that_turn_in_the_middle_of_a_span_are_solved() -> None:
+    """Positions and accelerations are equal and velocities opposite at both ends: Ruckig 0.19.4 crashes on these."""
+    control = np.array([0.0, 0.0, 0.0, 0.1, 0.2, 0.2, 0.1, 0.0, 0.0, 0.0])[:, None]
+    motion = TimedSpline(control, 0.1, Start.at_rest(np.zeros(1))).trajectory(["joint"])
+    middle = len(motion.times) // 2 - 1
+    assert motion.positions[middle] == motion.positions[middle + 1]
+    assert motion.velocities[middle] == -motion.velocities[middle + 1] != 0.0
+    limits = Limits(*(np.full(1, bound) for bound in (-10.0, 10.0, 10.0, 100.0, 1e4)))
+    made = calm(motion, limits, tolerance=0.0)
+    assert made is not None and made.solved == made.problems
+    np.testing.assert_allclose(made.trajectory(motion.times), motion.positions, atol=1e-12)

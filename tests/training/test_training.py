@@ -26,17 +26,13 @@ from apex_ompl.model.proposals import Sampling
 from apex_ompl.paths.candidates import first_valid
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import FINE_RESOLUTION
-from apex_ompl.training.kernel_problems import (
-    load_kernel_problems,
-    query_from_problem,
-    save_kernel_problems,
-    success_rates,
-)
+from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems
 from apex_ompl.training.records import Paths
 from apex_ompl.training.run import TrainingError, read_log
 from apex_ompl.training.store import Store, load, save
 from apex_ompl.training.torch_model import TorchModel, load_torch_model
 from apex_ompl.training.training import DistributedProcess, Trainer
+from apex_ompl.training.validation import query_from_problem, success_rates
 from apex_ompl.util.process import one_torch_thread
 
 
