@@ -88,6 +88,8 @@ def optimized_motion(
 
     search = _Search(optimizer, timing.method, check, stop)
     found = search.proved(optimizer.fastest(path.states, stop))
+    if found is None:
+        found = search.proved(optimizer.fastest(path.states, stop, narrow=True))
     for goal, least in _other_goals(setup, path, limits):
         if found is not None and least >= SOONER * found.spline.duration:
             break

@@ -10,7 +10,7 @@ proved.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -20,6 +20,7 @@ from apex_ompl.kernel.duration import DurationReport, DurationSettings, TimeGrid
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.paths.path import resample
 from apex_ompl.robot.model import Limits
+from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline, basis
 from apex_ompl.types import Array, Flags
@@ -42,6 +43,8 @@ DEEP, STUCK = -0.02, 0.8  # clearance of a motion with little hope [m], and leas
 SLOWER = 1.15  # ratio of its duration to the one that it is to undercut
 PROX = 1e-3
 LARGEST, CAREFUL = 0.25, 0.06  # change of a control point in a step, and where these go through an obstacle [rad]
+DETOUR, WORTH = 1.03, 0.98  # over the direct duration, beyond which less margin is tried, and what it has to save
+GREW = 1.3  # ratio of a duration to that of the first guess
 LOST = -0.01  # clearance of a motion that is on the wrong side of an obstacle [m]
 DECREASE = 0.3
 STEPS = 30
@@ -72,11 +75,12 @@ class Level:
 
 LEVELS = (
     Level(10.0, 4, 0.005, 0.04, 1.03, 1e-4, 4e-2),
-    Level(25.0, 4, 0.003, 0.02, 1.01, 2e-5, 2e-2),
-    Level(57.0, 2, 0.001, 0.02, 1.003, 5e-6, 5e-3),
+    Level(25.0, 4, 0.005, 0.02, 1.01, 2e-5, 2e-2),
+    Level(57.0, 2, 0.005, 0.02, 1.003, 5e-6, 5e-3),
 )
-CALM = Level(57.0, 3, 0.001, 0.03, 1.0, 1e-4, 2e-2)
-REPAIR = Level(57.0, 4, 0.001, 0.03, 1.01, 2e-5, 5e-3)
+NARROW_LEVELS = tuple(replace(level, margin=0.001) for level in LEVELS)
+CALM = Level(57.0, 3, 0.005, 0.03, 1.0, 1e-4, 2e-2)
+REPAIR = Level(57.0, 4, 0.002, 0.03, 1.01, 2e-5, 5e-3)
 
 
 def check_objective(objective: str, calm_factor: float) -> None:
@@ -113,7 +117,7 @@ class DurationOptimizer:
         self._limits[:, self._held] = 0.0
 
     def fastest(
-        self, states: Array, stop: Callable[[], bool] = lambda: False, most: float = np.inf
+        self, states: Array, stop: Callable[[], bool] = lambda: False, most: float = np.inf, narrow: bool = False
     ) -> TimedSpline | None:  # fmt: skip
         """Return a locally fastest motion near a path.
 
@@ -121,6 +125,7 @@ class DurationOptimizer:
             states: The path, shape (N, dof).
             stop: Called between rounds; True ends the optimization.
             most: Duration that the motion is to undercut [s]; where a round leaves little hope, the rest are left out.
+            narrow: Whether the margin is small from the first round on, for paths through narrow passages.
 
         Returns:
             The motion from the first state to the last, or None where these are one, the path cannot be cleared,
@@ -135,15 +140,23 @@ class DurationOptimizer:
             return None
         to_undercut = np.isfinite(most)
         clearance = float(self.kernel.clearance(resample(states, FEW_STATES)).min()) if to_undercut else 0.0
-        better, report = self._lowered(spline, LEVELS[0])
-        if report.clearance < LOST and not to_undercut:  # a step went through an obstacle
-            better, report = self._lowered(spline, LEVELS[0], largest=CAREFUL)
-        for level in LEVELS[1:]:
+        levels = NARROW_LEVELS if narrow else LEVELS
+        better, report = self._lowered(spline, levels[0])
+        if not to_undercut and better.duration > GREW * self.least_duration(spline):  # the margin cannot be kept
+            levels = NARROW_LEVELS
+            better, report = self._lowered(spline, levels[0])
+        if not to_undercut and report.clearance < LOST:  # a step went through an obstacle
+            better, report = self._lowered(spline, levels[0], largest=CAREFUL)
+        for level in levels[1:]:
             hopeless = report.clearance < (min(DEEP, STUCK * clearance) if to_undercut else LOST)
             if hopeless or better.duration > SLOWER * most or stop():
                 return None
             clearance = report.clearance
             better, report = self._lowered(self._refitted(better, level), level)
+        if better.duration > DETOUR * float(direct_durations(states[0], states[-1:], self.limits)[0]) and not stop():
+            closer, report = self._lowered(better, NARROW_LEVELS[-1])
+            if report.clearance > LOST and closer.duration < WORTH * better.duration:
+                return closer
         return better
 
     def cleared(self, spline: TimedSpline, times: int = 1) -> TimedSpline:
