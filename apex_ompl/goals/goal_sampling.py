@@ -37,6 +37,7 @@ NEAREST = 4  # states that are improved by random search
 NEAR, APART = 0.1, 0.5  # least distance, of the joint that moves most, of the nearest states, and of others [rad]
 FAR = 1.5  # ratio of the duration to a state to that of the nearest, up to which it is returned
 SAME = 0.02  # distance up to which states collide where one does [rad]
+KEPT_CLEAR, CLOSE = 0.005, 0.1  # clearance that states keep [m], and share of the duration that one in contact costs
 MARGIN = 0.05  # clearance that is enough [m]
 CLEARING_ROUNDS = 12  # of random search for a free state
 CHILDREN = 16  # states of a round of random search
@@ -245,7 +246,7 @@ class _Search:
 
     def nearest(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
         """Return the free states that are nearest in time, see :meth:`free`."""
-        return states[self.free(states, self.durations(states), count, apart, taken)]
+        return states[self.free(states, self.durations(states) * self._closeness(states), count, apart, taken)]
 
     def costs(self, states: Array) -> Array:
         """Return the durations to states, more by a share where the straight lines to them collide, shape (N,) [s]."""
@@ -254,7 +255,7 @@ class _Search:
         clearances = self.checker.kernel.clearance(lines.reshape(-1, states.shape[1]), 0.0)
         least = np.minimum(ends[0], ends[1:])
         depths = np.maximum(least - clearances.reshape(len(ALONG), len(states), 2), 0.0).sum(axis=2).mean(axis=0)
-        costs: Array = self.durations(states) * (1.0 + DETOUR * depths / (depths + DEPTH))
+        costs: Array = self.durations(states) * (1.0 + DETOUR * depths / (depths + DEPTH)) * self._closeness(states)
         return costs
 
     def improved(self, near: Array, known: Array) -> Array:
@@ -297,6 +298,12 @@ class _Search:
         change += pull * rng.random((CHILDREN, 1)) * (self.start - children)
         children[:, free] += change[:, free]
         return self.returned(children)
+
+    def _closeness(self, states: Array) -> Array:
+        """Return factors on durations for states that are near something, shape (N,)."""
+        near = KEPT_CLEAR - self.checker.kernel.clearance(states, KEPT_CLEAR)
+        factors: Array = 1.0 + CLOSE * np.minimum(near.max(axis=1, initial=0.0) / KEPT_CLEAR, 1.0)
+        return factors
 
     def _clearances(self, states: Array) -> Array:
         """Return the sum of the least clearances to obstacles and of the robot to itself, shape (N,) [m]."""
