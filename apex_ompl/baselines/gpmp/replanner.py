@@ -14,8 +14,9 @@ from apex_ompl.baselines.gpmp.planner import GPMP, GPMP2, GaussianProcessParamet
 from apex_ompl.kernel.path import ClearanceCosts, clearance_costs
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import RunContext
+from apex_ompl.moving.motion_optimizer import InitialMotion, shortest_duration
 from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
-from apex_ompl.moving.search import STATES, InitialMotion, Search, rest_of_route, shortest_duration
+from apex_ompl.moving.search import STATES, Search, rest_of_route
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline

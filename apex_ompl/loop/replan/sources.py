@@ -12,15 +12,8 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.search import TreePair
 from apex_ompl.model.query import Query
 from apex_ompl.moving.context import RunContext
-from apex_ompl.moving.search import (
-    STATES,
-    InitialMotion,
-    Search,
-    fresh_checker,
-    place_nearest,
-    rest_of_route,
-    shortest_duration,
-)
+from apex_ompl.moving.motion_optimizer import InitialMotion, shortest_duration
+from apex_ompl.moving.search import STATES, Search, fresh_checker, place_nearest, rest_of_route
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.paths.path import SEARCH_RESOLUTION, resample
