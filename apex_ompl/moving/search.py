@@ -231,7 +231,8 @@ class Source(Protocol):
         """Its name."""
 
     def prepare(self, context: RunContext) -> None:
-        """Load what it needs, before a run."""
+        """Load what it needs, before a run; nothing by default."""
+        return
 
     def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield initial motions, and spend what they cost."""
