@@ -13,90 +13,59 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.api import load_problem, plan, run, setup
-    from apex_ompl.collision.cloud_contact import filter_points
-    from apex_ompl.errors import ApexError
-    from apex_ompl.loop.result import RunResult
-    from apex_ompl.loop.sensor import Sensor
-    from apex_ompl.model.checkpoint import load_model
-    from apex_ompl.moving.retime import retime
-    from apex_ompl.moving.settings import LoopSettings
-    from apex_ompl.paths.path import Path
-    from apex_ompl.planning.planner import MotionPlanner
-    from apex_ompl.planning.world import World
-    from apex_ompl.result import PlanResult, PlanStatus
-    from apex_ompl.robot import Limits, Robot, load_robot
-    from apex_ompl.scene.bodies import AttachedObject, Obstacle
-    from apex_ompl.scene.points import points_from_depth
-    from apex_ompl.scene.problem import Alignment, PoseTarget, Problem
-    from apex_ompl.timing import Timing, Trajectory, time_path
-    from apex_ompl.viz.view import view
+    from apex_ompl.api import load_problem as load_problem
+    from apex_ompl.api import plan as plan
+    from apex_ompl.api import run as run
+    from apex_ompl.api import setup as setup
+    from apex_ompl.collision.cloud_contact import filter_points as filter_points
+    from apex_ompl.errors import ApexError as ApexError
+    from apex_ompl.loop.result import RunResult as RunResult
+    from apex_ompl.loop.sensor import Sensor as Sensor
+    from apex_ompl.model.checkpoint import load_model as load_model
+    from apex_ompl.moving.retime import retime as retime
+    from apex_ompl.moving.settings import LoopSettings as LoopSettings
+    from apex_ompl.paths.path import Path as Path
+    from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
+    from apex_ompl.planning.world import World as World
+    from apex_ompl.result import PlanResult as PlanResult
+    from apex_ompl.result import PlanStatus as PlanStatus
+    from apex_ompl.robot import Limits as Limits
+    from apex_ompl.robot import Robot as Robot
+    from apex_ompl.robot import load_robot as load_robot
+    from apex_ompl.scene.bodies import AttachedObject as AttachedObject
+    from apex_ompl.scene.bodies import Obstacle as Obstacle
+    from apex_ompl.scene.points import points_from_depth as points_from_depth
+    from apex_ompl.scene.problem import Alignment as Alignment
+    from apex_ompl.scene.problem import PoseTarget as PoseTarget
+    from apex_ompl.scene.problem import Problem as Problem
+    from apex_ompl.timing import Timing as Timing
+    from apex_ompl.timing import Trajectory as Trajectory
+    from apex_ompl.timing import time_path as time_path
+    from apex_ompl.viz.view import view as view
 
 __version__ = "0.1.0"
 
-_HOMES = {  # modules that public names are imported from when they are first used
-    "Alignment": "scene.problem",
-    "ApexError": "errors",
-    "AttachedObject": "scene.bodies",
-    "Limits": "robot",
-    "LoopSettings": "moving.settings",
-    "MotionPlanner": "planning.planner",
-    "Obstacle": "scene.bodies",
-    "Path": "paths.path",
-    "PlanResult": "result",
-    "PlanStatus": "result",
-    "PoseTarget": "scene.problem",
-    "Problem": "scene.problem",
-    "Robot": "robot",
-    "RunResult": "loop.result",
-    "Sensor": "loop.sensor",
-    "Timing": "timing",
-    "Trajectory": "timing",
-    "World": "planning.world",
-    "filter_points": "collision.cloud_contact",
-    "load_model": "model.checkpoint",
-    "load_problem": "api",
-    "load_robot": "robot",
-    "plan": "api",
-    "points_from_depth": "scene.points",
-    "retime": "moving.retime",
-    "run": "api",
-    "setup": "api",
-    "time_path": "timing",
-    "view": "viz.view",
-}
-
-__all__ = [
-    "Alignment",
-    "ApexError",
-    "AttachedObject",
-    "Limits",
-    "LoopSettings",
-    "MotionPlanner",
-    "Obstacle",
-    "Path",
-    "PlanResult",
-    "PlanStatus",
-    "PoseTarget",
-    "Problem",
-    "Robot",
-    "RunResult",
-    "Sensor",
-    "Timing",
-    "Trajectory",
-    "World",
-    "filter_points",
-    "load_model",
-    "load_problem",
-    "load_robot",
-    "plan",
-    "points_from_depth",
-    "retime",
-    "run",
-    "setup",
-    "time_path",
-    "view",
-]
-
-
-__getattr__, __dir__ = lazy_names(__name__, _HOMES, ("__version__",))
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "api": "load_problem plan run setup",
+        "collision.cloud_contact": "filter_points",
+        "errors": "ApexError",
+        "loop.result": "RunResult",
+        "loop.sensor": "Sensor",
+        "model.checkpoint": "load_model",
+        "moving.retime": "retime",
+        "moving.settings": "LoopSettings",
+        "paths.path": "Path",
+        "planning.planner": "MotionPlanner",
+        "planning.world": "World",
+        "result": "PlanResult PlanStatus",
+        "robot": "Limits Robot load_robot",
+        "scene.bodies": "AttachedObject Obstacle",
+        "scene.points": "points_from_depth",
+        "scene.problem": "Alignment PoseTarget Problem",
+        "timing": "Timing Trajectory time_path",
+        "viz.view": "view",
+    },
+    ("__version__",),
+)

@@ -23,7 +23,7 @@ from apex_ompl.timing.files import KNOTS, MESSAGES
 from apex_ompl.types import Array
 from apex_ompl.util.display import Summary, one_line
 from apex_ompl.util.files import BROKEN, pack_archive, path_text, read_archive, suffix_of, write_atomically
-from apex_ompl.util.schema import dump_yaml, read_json, read_yaml
+from apex_ompl.util.schema import check_version, dump_yaml, read_json, read_yaml
 from apex_ompl.util.validation import finite_array, finite_numbers
 
 SCHEMA = "apex-ompl/result/2"
@@ -214,8 +214,7 @@ class PlanResult:
             data = _read_npz(path)
         else:
             data = (read_json if path.suffix == ".json" else read_yaml)(path, "result file")
-        if data.get("schema") != SCHEMA:
-            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        check_version(data, SCHEMA, path)
         older = {
             "clearance_pair": ["", ""],
             "timing_method": "",

@@ -15,7 +15,7 @@ primitives keep a margin to start and goal; about half of them are near the moti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -24,48 +24,10 @@ import numpy as np
 from apex_ompl.goals.state_sampling import HandPoseSampler, Interval, scene_kernel
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.problems import alignment
-from apex_ompl.problems.broad_furniture import (
-    barrels,
-    bench,
-    bottles,
-    cabinet,
-    cage,
-    chairs,
-    crates,
-    drawers,
-    nested,
-    packed,
-    pigeonholes,
-    rack,
-    stairs,
-    tables,
-)
-from apex_ompl.problems.broad_parts import Composition, Parts, extents, kept, place, shift, site, turn
+from apex_ompl.problems.broad_furniture import FURNITURE
+from apex_ompl.problems.broad_parts import Composition, Grammar, Parts, extents, kept, place, shift, site, turn
 from apex_ompl.problems.broad_representation import Representation, draw_representation, feasible, obstacles
-from apex_ompl.problems.broad_structures import (
-    arches,
-    blobs,
-    boulders,
-    bowls,
-    clutter,
-    curtains,
-    domes,
-    doorways,
-    gutters,
-    hooks,
-    hoops,
-    lids,
-    louvres,
-    maze,
-    mikado,
-    pebbles,
-    posts,
-    program,
-    shards,
-    slits,
-    solid,
-    windows,
-)
+from apex_ompl.problems.broad_structures import STRUCTURES, solid
 from apex_ompl.problems.broad_tasks import (
     EndSampler,
     Held,
@@ -76,20 +38,7 @@ from apex_ompl.problems.broad_tasks import (
     scene_of,
     wide_region,
 )
-from apex_ompl.problems.broad_unseen import (
-    blades,
-    bristles,
-    honeycomb,
-    machine,
-    net,
-    pipework,
-    skeleton,
-    spiral,
-    tree,
-    truss,
-    tunnel,
-    wheels,
-)
+from apex_ompl.problems.broad_unseen import STRANGERS
 from apex_ompl.problems.objects import primitive
 from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, empty_hand_tables, robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -160,22 +109,8 @@ def _draw_obstacles(rng: np.random.Generator, tables: RobotTables, ends: Array) 
     return tuple(scene)
 
 
-Grammar = Callable[[np.random.Generator], Composition]
-
-
-def _by_name(*grammars: Grammar) -> Mapping[str, Grammar]:
-    return MappingProxyType({grammar.__name__: grammar for grammar in grammars})
-
-
 GRAMMARS: Mapping[str, Mapping[str, Grammar]] = MappingProxyType({
-    SUITE: _by_name(
-        rack, drawers, cabinet, tables, stairs, bench, chairs, crates, pigeonholes, barrels, cage, bottles, nested,
-        packed, windows, slits, maze, louvres, doorways, lids, curtains, shards, arches, hoops, domes, gutters,
-        hooks, bowls, clutter, pebbles, boulders, posts, mikado, blobs, program,
-    ),
-    UNSEEN: _by_name(
-        pipework, tunnel, tree, spiral, net, machine, skeleton, blades, wheels, truss, honeycomb, bristles,
-    ),
+    SUITE: MappingProxyType({**FURNITURE, **STRUCTURES}), UNSEEN: MappingProxyType(STRANGERS),
 })  # fmt: skip
 """Suite -> its levels -> grammar."""
 

@@ -23,6 +23,7 @@ from apex_ompl.problems.broad_parts import (
     between,
     bounds,
     box,
+    by_name,
     frame,
     grid,
     grille,
@@ -305,3 +306,10 @@ def packed(rng: np.random.Generator) -> Composition:
         )
     places += [Place((low + high) / 2, FORWARD), Place((low + high) / 2, DOWN)]
     return Composition(parts, places).placed(shift(0, 0, counts[2] * step / 2))
+
+
+FURNITURE = by_name(
+    rack, drawers, cabinet, tables, stairs, bench, chairs, crates, pigeonholes, barrels, cage, bottles, nested,
+    packed,
+)  # fmt: skip
+"""Grammars of furniture and containers by name."""

@@ -411,9 +411,10 @@ class Composition:
         return Composition(mirror(self.parts, 1), [_placed(flip, p) for p in self.places], self.stance)
 
 
-def joined(
-    draw: Callable[[np.random.Generator], Iterable[Composition]],
-) -> Callable[[np.random.Generator], Composition]:
+Grammar = Callable[[np.random.Generator], Composition]
+
+
+def joined(draw: Callable[[np.random.Generator], Iterable[Composition]]) -> Grammar:
     """Return a function that draws one composition of all those that ``draw`` yields."""
 
     @wraps(draw)
@@ -422,6 +423,11 @@ def joined(
         return Composition([p for one in found for p in one.parts], [p for one in found for p in one.places])
 
     return drawn
+
+
+def by_name(*grammars: Grammar) -> dict[str, Grammar]:
+    """Return grammars by their names."""
+    return {grammar.__name__: grammar for grammar in grammars}
 
 
 def _placed(pose: Array, one: Place) -> Place:

@@ -27,6 +27,7 @@ from apex_ompl.problems.broad_parts import (
     bent_sheet,
     bounds,
     box,
+    by_name,
     circle,
     frame,
     grid,
@@ -409,3 +410,10 @@ def _program(rng: np.random.Generator, depth: int) -> Parts:
     if len(found) > MOST:
         found = [found[k] for k in rng.permutation(len(found))[:MOST]]
     return found
+
+
+STRUCTURES = by_name(
+    windows, slits, maze, louvres, doorways, lids, curtains, shards, arches, hoops, domes, gutters, hooks, bowls,
+    clutter, pebbles, boulders, posts, mikado, blobs, program,
+)  # fmt: skip
+"""Grammars of panels, single curved objects and scattered solids by name."""

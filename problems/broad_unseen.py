@@ -28,6 +28,7 @@ from apex_ompl.problems.broad_parts import (
     ball,
     bend,
     box,
+    by_name,
     circle,
     fan,
     hollow_box,
@@ -334,3 +335,9 @@ def bristles(rng: np.random.Generator) -> Composition:
             Place(pose[:3, 3] + (long + core + 0.1) * way / np.linalg.norm(way)) for way in rng.normal(size=(3, 3))
         ]
     return Composition(parts, places)
+
+
+STRANGERS = by_name(
+    pipework, tunnel, tree, spiral, net, machine, skeleton, blades, wheels, truss, honeycomb, bristles,
+)  # fmt: skip
+"""Grammars of networks, tunnels, trees, helices, nets, machines and frameworks by name."""

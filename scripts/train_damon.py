@@ -17,7 +17,6 @@ import numpy as np
 from apex_ompl.baselines import weights_folder
 from apex_ompl.baselines.damon.latent_graph import chosen_nodes, consecutive, edges
 from apex_ompl.baselines.damon.manifold import (
-    CONFIG,
     DECODED,
     MOST_NODES,
     SCHEMA,
@@ -31,6 +30,7 @@ from apex_ompl.baselines.damon.manifold import (
 from apex_ompl.baselines.damon.manifold_training import sample_states, split_sample
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.model.checkpoint import CONFIG
 from apex_ompl.robot import load_robot
 from apex_ompl.training.store import load
 from apex_ompl.util.entry_point import run_script

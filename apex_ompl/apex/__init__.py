@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.apex.context import SolveContext
-    from apex_ompl.apex.models import make_query
-    from apex_ompl.apex.parameters import ApexParameters
-    from apex_ompl.apex.stages.stage import Stage
+    from apex_ompl.apex.context import SolveContext as SolveContext
+    from apex_ompl.apex.models import make_query as make_query
+    from apex_ompl.apex.parameters import ApexParameters as ApexParameters
+    from apex_ompl.apex.stages.stage import Stage as Stage
 
-__all__ = ["ApexParameters", "SolveContext", "Stage", "make_query"]
-
-__getattr__, __dir__ = lazy_names(
+__all__, __getattr__, __dir__ = lazy_names(
     __name__,
-    {"ApexParameters": "parameters", "SolveContext": "context", "Stage": "stages.stage", "make_query": "models"},
+    {"context": "SolveContext", "models": "make_query", "parameters": "ApexParameters", "stages.stage": "Stage"},
 )

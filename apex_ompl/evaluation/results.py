@@ -22,6 +22,7 @@ from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import INSIDE
 from apex_ompl.util.files import check_writable, read_text, write_atomically
+from apex_ompl.util.schema import check_version, read_json
 from apex_ompl.util.validation import check_integer, check_number
 
 SCHEMA = "apex-ompl/benchmark/1"
@@ -61,16 +62,12 @@ class Results:
         """
         folder = Path(folder)
         try:
-            about = json.loads(read_text(folder / ABOUT, ROLE))
+            about = read_json(folder / ABOUT, ROLE)
             lines = read_text(folder / RUNS, ROLE).splitlines() if (folder / RUNS).exists() else []
         except MissingFileError as error:
             why = f"expected {ABOUT} and {RUNS} there, as apex-ompl bench writes them"
             raise MissingFileError(str(folder), ROLE, why) from error
-        except (ValueError, RecursionError) as error:
-            raise FileFormatError(str(folder / ABOUT), "", str(error), "expected JSON") from error
-        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
-            found = about.get("schema") if isinstance(about, dict) else about
-            raise FileFormatError(str(folder / ABOUT), "schema", found, f"expected {SCHEMA!r}")
+        check_version(about, SCHEMA, folder / ABOUT)
         for name, kind in ABOUT_KINDS.items():
             if not isinstance(about.get(name), kind):
                 expected = "expected a list" if kind is list else "expected a mapping"

@@ -30,6 +30,15 @@ class Table:
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
 
+    @classmethod
+    def by_level(cls, title: str, head: Sequence[str], cells: Iterable[tuple[Statistics, Sequence[str]]]) -> Table:
+        """Return a table with a row for each statistics: the level where it changes, the planner, and some cells."""
+        rows, last = list[Sequence[str]](), ""
+        for one, texts in cells:
+            rows.append(["" if one.experiment == last else one.experiment, one.label, *texts])
+            last = one.experiment
+        return cls(title, ["level", "planner", *head], rows)
+
     def markdown(self) -> str:
         """Return the table as Markdown."""
         lines = [self.head, ["---", "---", *["---:"] * (len(self.head) - 2)], *self.rows]
@@ -107,31 +116,20 @@ def tables(results: Results) -> list[Table]:
 
 def successes(found: Iterable[Statistics]) -> Table:
     """Return the table of shares solved, in all and within some times."""
-    rows, last = [], ""
+    rows = []
     for f in found:
         low, high = share_interval(len(f.solved), len(f.runs))
         within = [_share(f.share_within(t)) if t <= f.limit else "-" for t in SHARE_TIMES]
         share = f"{_share(len(f.solved) / len(f.runs))} ({_share(low)} to {_share(high)})"
         trees = sum(f.by[name] for name in TREES if f.planner != name) / len(f.runs)
-        rows.append(
-            [_once(f.experiment, last), f.label, str(len(f.runs)), f"{f.limit:g}", share, *within, _share(trees)]
-        )
-        last = f.experiment
-    head = [
-        "level",
-        "planner",
-        "N",
-        "limit s",
-        "solved (95 %, Wilson)",
-        *(f"in {t:g} s" for t in SHARE_TIMES),
-        "by its trees alone",
-    ]
-    return Table("Success", head, rows)
+        rows.append((f, [str(len(f.runs)), f"{f.limit:g}", share, *within, _share(trees)]))
+    head = ["N", "limit s", "solved (95 %, Wilson)", *(f"in {t:g} s" for t in SHARE_TIMES), "by its trees alone"]
+    return Table.by_level("Success", head, rows)
 
 
 def times(found: Iterable[Statistics]) -> Table:
     """Return the table of times to the first path and to the end."""
-    rows, last = [], ""
+    rows = []
     for f in found:
         low, high = percentile_interval(f.times(), 50.0)
         first = [f"{_ms(f.percentile('first', 50))} ({_ms(low)} to {_ms(high)})"]
@@ -139,35 +137,32 @@ def times(found: Iterable[Statistics]) -> Table:
         total = [_ms(f.percentile("total", p)) for p in (50, 95, 99)]
         setup = [run["setup"] for run in f.runs if run["setup"] is not None]
         made = _ms(float(np.median(setup))) if setup else "-"
-        rows.append([_once(f.experiment, last), f.label, *first, *total, made])
-        last = f.experiment
-    head = ["level", "planner", "first path p50 ms (95 %, bootstrap)", "p95", "p99", "end p50 ms", "p95", "p99"]
-    return Table("Time", [*head, "setup ms"], rows)
+        rows.append((f, [*first, *total, made]))
+    head = ["first path p50 ms (95 %, bootstrap)", "p95", "p99", "end p50 ms", "p95", "p99", "setup ms"]
+    return Table.by_level("Time", head, rows)
 
 
 def paths(found: Iterable[Statistics]) -> Table:
     """Return the table of lengths, jerks and clearances."""
-    rows, last = [], ""
+    rows = []
     for f in found:
         numbers = [_number(f.median(key)) for key in ("raw_length", "length", "raw_jerk", "jerk")]
         clearance = f.median("clearance")
         numbers.append("-" if math.isnan(clearance) else f"{1e3 * clearance:.1f}")
-        rows.append([_once(f.experiment, last), f.label, *numbers])
-        last = f.experiment
-    head = ["level", "planner", "first length rad", "length rad", "first jerk rad/s^3", "jerk rad/s^3", "clearance mm"]
-    return Table("Paths (medians of solved runs; jerk of a run in 1 s at even speed)", head, rows)
+        rows.append((f, numbers))
+    head = ["first length rad", "length rad", "first jerk rad/s^3", "jerk rad/s^3", "clearance mm"]
+    return Table.by_level("Paths (medians of solved runs; jerk of a run in 1 s at even speed)", head, rows)
 
 
 def stages(found: Iterable[Statistics]) -> Table:
     """Return the table of shares solved by each stage."""
     chosen = [f for f in found if len(f.by) > 1 or set(f.by) - {f.planner}]
     names = sorted({name for f in chosen for name in f.by})
-    rows, last = [], ""
+    rows = []
     for f in chosen:
         shares = [_share(f.by[name] / len(f.runs)) for name in names]
-        rows.append([_once(f.experiment, last), f.label, *shares, _share(1.0 - len(f.solved) / len(f.runs))])
-        last = f.experiment
-    return Table("Share solved by each stage", ["level", "planner", *names, "not solved"], rows)
+        rows.append((f, [*shares, _share(1.0 - len(f.solved) / len(f.runs))]))
+    return Table.by_level("Share solved by each stage", [*names, "not solved"], rows)
 
 
 def warnings(results: Results) -> list[str]:
@@ -230,10 +225,6 @@ def about(results: Results) -> list[tuple[str, Any]]:
         ("First run of a process, not counted", warm),
     ]  # fmt: skip
     return pairs
-
-
-def _once(name: str, last: str) -> str:
-    return "" if name == last else name
 
 
 def _share(value: float) -> str:

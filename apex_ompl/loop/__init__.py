@@ -7,21 +7,15 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.loop.environment import Environment, Observation
-    from apex_ompl.loop.result import Event, Outcome, RunResult
-    from apex_ompl.loop.sensor import Sensor, SensorStream
+    from apex_ompl.loop.environment import Environment as Environment
+    from apex_ompl.loop.environment import Observation as Observation
+    from apex_ompl.loop.result import Event as Event
+    from apex_ompl.loop.result import Outcome as Outcome
+    from apex_ompl.loop.result import RunResult as RunResult
+    from apex_ompl.loop.sensor import Sensor as Sensor
+    from apex_ompl.loop.sensor import SensorStream as SensorStream
 
-__all__ = ["Environment", "Event", "Observation", "Outcome", "RunResult", "Sensor", "SensorStream"]
-
-__getattr__, __dir__ = lazy_names(
+__all__, __getattr__, __dir__ = lazy_names(
     __name__,
-    {
-        "Environment": "environment",
-        "Event": "result",
-        "Observation": "environment",
-        "Outcome": "result",
-        "RunResult": "result",
-        "Sensor": "sensor",
-        "SensorStream": "sensor",
-    },
+    {"environment": "Environment Observation", "result": "Event Outcome RunResult", "sensor": "Sensor SensorStream"},
 )

@@ -20,7 +20,7 @@ from apex_ompl.timing.files import KNOTS
 from apex_ompl.types import Array
 from apex_ompl.util.display import Summary, fields_line, one_line
 from apex_ompl.util.files import BROKEN, pack_archive, path_text, read_archive, suffix_of, write_atomically
-from apex_ompl.util.schema import read_json
+from apex_ompl.util.schema import check_version, read_json
 from apex_ompl.util.validation import check_number, check_seed, finite_array, finite_numbers
 
 SCHEMA = "apex-ompl/run/1"
@@ -177,8 +177,7 @@ class RunResult:
         else:
             data, arrays = read_archive(path, ARCHIVE, ROLE)
             data["trajectory"] = arrays
-        if data.get("schema") != SCHEMA:
-            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        check_version(data, SCHEMA, path)
         try:
             return _parsed(data, str(path))
         except ParameterError as error:

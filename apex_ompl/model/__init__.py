@@ -7,11 +7,8 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.model.checkpoint import load_model
-    from apex_ompl.model.proposals import Proposals, Sampling
+    from apex_ompl.model.checkpoint import load_model as load_model
+    from apex_ompl.model.proposals import Proposals as Proposals
+    from apex_ompl.model.proposals import Sampling as Sampling
 
-__all__ = ["Proposals", "Sampling", "load_model"]
-
-__getattr__, __dir__ = lazy_names(
-    __name__, {"Proposals": "proposals", "Sampling": "proposals", "load_model": "checkpoint"}
-)
+__all__, __getattr__, __dir__ = lazy_names(__name__, {"checkpoint": "load_model", "proposals": "Proposals Sampling"})

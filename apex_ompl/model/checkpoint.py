@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,14 @@ from apex_ompl.model.config import ModelConfig
 from apex_ompl.model.proposals import TrajectoryModel
 from apex_ompl.util.files import BROKEN, is_file, path_text, read_file
 from apex_ompl.util.forking import ProcessLock
-from apex_ompl.util.schema import StrictModel, read_json, validate
+from apex_ompl.util.schema import StrictModel, read_record
 
 SCHEMA = "apex-ompl/model/1"
 SHIPPED = Path(__file__).parent / "checkpoints"
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
+ROLE = "file of a checkpoint"
 TORCH = "apex_ompl.training.torch_model"  # for models that NumPy cannot evaluate; by name, since model knows no torch
+T = TypeVar("T")
 PICKLES = (".pt", ".pth", ".ckpt", ".bin", ".pkl", ".pickle")
 
 
@@ -84,7 +86,7 @@ def read_checkpoint(
     folder = _folder(name)
     for file in (CONFIG, WEIGHTS):
         if not is_file(folder / file):
-            raise MissingFileError(str(folder / file), "file of a checkpoint")
+            raise MissingFileError(str(folder / file), ROLE)
     source = folder / WEIGHTS
     config = read_config(folder)
     if robot is not None and config.model.robot != robot:
@@ -92,18 +94,19 @@ def read_checkpoint(
     return config, read_weights(source, config.digest), source
 
 
-def read_weights(source: Path, digest: str) -> dict[str, NDArray[Any]]:
+def read_weights(source: Path, digest: str, role: str = ROLE) -> dict[str, NDArray[Any]]:
     """Return the weights in a file of a checkpoint by name, matrices in eight bits with their scales.
 
     Args:
         source: The file.
         digest: SHA-256 digest that it must have.
+        role: Description of the file for the error.
 
     Raises:
         MissingFileError: The file cannot be read.
         FileFormatError: It is damaged, or has weights that are not finite.
     """
-    content = read_file(source, "file of a checkpoint")
+    content = read_file(source, role)
     found = hashlib.sha256(content).hexdigest()
     if found != digest:
         raise FileFormatError(str(source), "", f"SHA-256 {found[:12]}...", f"expected {digest[:12]}...: damaged")
@@ -144,20 +147,26 @@ def shared_model(name: str | os.PathLike[str], *, device: str = "cpu", robot: st
     Raises:
         ApexError: As :func:`load_model` does.
     """
-    folder = _folder(name)
-    files = [folder / file for file in (CONFIG, WEIGHTS)]
-    stamp = tuple(file.stat().st_mtime_ns for file in files if is_file(file))
-    with _loading:
-        return _shared(str(folder.absolute()), stamp, device, robot)
+    return _shared(_folder(name), device=device, robot=robot)
 
 
-_loading = ProcessLock()
+class FolderCache(Generic[T]):
+    """What was last loaded from up to four folders of weights; it is loaded again when their files change."""
+
+    def __init__(self, load: Callable[..., T]) -> None:
+        """Load by a function of the folder's path, a text, and of options by name."""
+        self._lock = ProcessLock()
+        self._kept = lru_cache(maxsize=4)(lambda folder, stamp, **options: load(folder, **options))
+
+    def __call__(self, folder: Path, **options: Any) -> T:
+        """Return what is in a folder, from the cache where its files are as they were."""
+        files = [folder / file for file in (CONFIG, WEIGHTS)]
+        stamp = tuple(file.stat().st_mtime_ns for file in files if is_file(file))
+        with self._lock:
+            return self._kept(str(folder.absolute()), stamp, **options)
 
 
-@lru_cache(maxsize=4)
-def _shared(folder: str, stamp: tuple[int, ...], device: str, robot: str | None) -> TrajectoryModel:
-    del stamp
-    return load_model(folder, device=device, robot=robot)
+_shared = FolderCache(load_model)
 
 
 def read_config(folder: Path) -> CheckpointConfig:
@@ -166,11 +175,7 @@ def read_config(folder: Path) -> CheckpointConfig:
     Raises:
         FileFormatError: The file is not one.
     """
-    path = folder / CONFIG
-    data = read_json(path, "file of a checkpoint")
-    if data.get("schema") != SCHEMA:
-        raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-    return validate(CheckpointConfig, data, str(path))
+    return read_record(folder / CONFIG, CheckpointConfig, ROLE)
 
 
 def shipped() -> tuple[str, ...]:

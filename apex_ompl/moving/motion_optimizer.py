@@ -1,4 +1,4 @@
-"""Optimization in space and time among dynamic obstacles, and a pool of candidates.
+"""Optimization in space and time among dynamic obstacles, from initial motions, and a pool of candidates.
 
 A motion starts from a moving state and ends at rest at a goal.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,40 @@ REFIT = 64  # states of a candidate that is refitted to another start
 FASTER = 0.9  # factor on the duration of a proved motion, from which a faster one is sought
 LONGEST = 60.0  # duration at which a candidate is dropped [s]
 LEAST = 1e-6  # clearance cost that counts as none
+
+
+class InitialMotion(NamedTuple):
+    """A motion that an optimization starts from.
+
+    Attributes:
+        states: States evenly spaced in time, shape (N, dof).
+        goal: Where it ends, shape (dof,).
+        duration: Estimate of its shortest duration without obstacles [s].
+        timed: Whether it is a motion of that duration, not a path.
+    """
+
+    states: Array
+    goal: Array
+    duration: float
+    timed: bool = False
+
+
+def shortest_duration(states: Array, limits: Limits, *, even: bool = False) -> float:
+    """Return a lower bound of the duration of a motion along a path [s], at least 0.1 s.
+
+    It is the largest of L_j / v_j over the joints, for lengths L_j of their ways and velocity limits v_j, and of
+    2 sqrt(d_j / a_j) for their displacements d_j and acceleration limits a_j. At an even pace of the path's parameter,
+    each of the N - 1 steps takes the same time: L_j is then N - 1 times the joint's longest step.
+
+    Args:
+        states: States of the path, shape (N, dof).
+        limits: Limits of the joints.
+        even: Whether the pace is even.
+    """
+    steps = np.abs(np.diff(states, axis=0))
+    way = len(steps) * steps.max(axis=0) if even else steps.sum(axis=0)
+    distance = np.abs(states[-1] - states[0]) / limits.acceleration
+    return float(max((way / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))
 
 
 @dataclass(frozen=True)

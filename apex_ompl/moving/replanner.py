@@ -94,7 +94,8 @@ class Replanner(Protocol):
     """Plans the robot's next motion while it follows the last one."""
 
     def prepare(self, context: RunContext) -> None:
-        """Load or compile what it needs, before a run."""
+        """Load or compile what it needs, before a run; nothing by default."""
+        return
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
         """Return a motion from the state at the time of joining on, which ends at rest, or none."""

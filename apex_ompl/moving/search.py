@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,9 +14,14 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import Following, RunContext
 from apex_ompl.moving.dynamic_obstacles import clearance_in_time
-from apex_ompl.moving.motion_optimizer import MotionOptimizer, MotionPool, MotionSettings
+from apex_ompl.moving.motion_optimizer import (
+    InitialMotion,
+    MotionOptimizer,
+    MotionPool,
+    MotionSettings,
+    shortest_duration,
+)
 from apex_ompl.moving.replanner import Request
-from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import standing, vector
 from apex_ompl.timing import Trajectory
@@ -218,22 +223,6 @@ class Search:
         return MotionPool(optimizer, self.start, request.join, self.budget, self.accepts, clearance_margin=beyond)
 
 
-class InitialMotion(NamedTuple):
-    """A motion that an optimization starts from.
-
-    Attributes:
-        states: States evenly spaced in time, shape (N, dof).
-        goal: Where it ends, shape (dof,).
-        duration: Estimate of its shortest duration without obstacles [s].
-        timed: Whether it is a motion of that duration, not a path.
-    """
-
-    states: Array
-    goal: Array
-    duration: float
-    timed: bool = False
-
-
 class Source(Protocol):
     """A source of initial motions."""
 
@@ -242,25 +231,11 @@ class Source(Protocol):
         """Its name."""
 
     def prepare(self, context: RunContext) -> None:
-        """Load what it needs, before a run."""
+        """Load what it needs, before a run; nothing by default."""
+        return
 
     def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield initial motions, and spend what they cost."""
-
-
-def shortest_duration(states: Array, limits: Limits) -> float:
-    """Return a lower bound of the duration of a motion along a path [s], at least 0.1 s.
-
-    It is the largest of L_j / v_j over the joints, for lengths L_j of their ways and velocity limits v_j, and of
-    2 sqrt(d_j / a_j) for their displacements d_j and acceleration limits a_j.
-
-    Args:
-        states: States of the path, shape (N, dof).
-        limits: Limits of the joints.
-    """
-    way = np.abs(np.diff(states, axis=0)).sum(axis=0)
-    distance = np.abs(states[-1] - states[0]) / limits.acceleration
-    return float(max((way / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))
 
 
 def fresh_checker(context: RunContext) -> CollisionChecker:

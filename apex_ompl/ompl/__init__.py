@@ -7,29 +7,19 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.ompl.setup import PlanningSetup, assemble
-    from apex_ompl.ompl.space import state_space, to_state
-    from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker, full_check
+    from apex_ompl.ompl.setup import PlanningSetup as PlanningSetup
+    from apex_ompl.ompl.setup import assemble as assemble
+    from apex_ompl.ompl.space import state_space as state_space
+    from apex_ompl.ompl.space import to_state as to_state
+    from apex_ompl.ompl.validity import MotionValidator as MotionValidator
+    from apex_ompl.ompl.validity import StateValidityChecker as StateValidityChecker
+    from apex_ompl.ompl.validity import full_check as full_check
 
-__all__ = [
-    "MotionValidator",
-    "PlanningSetup",
-    "StateValidityChecker",
-    "assemble",
-    "full_check",
-    "state_space",
-    "to_state",
-]
-
-__getattr__, __dir__ = lazy_names(
+__all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "MotionValidator": "validity",
-        "PlanningSetup": "setup",
-        "StateValidityChecker": "validity",
-        "assemble": "setup",
-        "full_check": "validity",
-        "state_space": "space",
-        "to_state": "space",
+        "setup": "PlanningSetup assemble",
+        "space": "state_space to_state",
+        "validity": "MotionValidator StateValidityChecker full_check",
     },
 )

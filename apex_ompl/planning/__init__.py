@@ -10,44 +10,25 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.planning.planner import MotionPlanner, StateCheck
-    from apex_ompl.planning.query import GoalSampler
-    from apex_ompl.planning.steps import (
-        FoundPath,
-        PlanQuery,
-        ProvedPath,
-        assemble,
-        check,
-        prove,
-        solve,
-        time,
-    )
-    from apex_ompl.planning.world import World
+    from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
+    from apex_ompl.planning.planner import StateCheck as StateCheck
+    from apex_ompl.planning.query import GoalSampler as GoalSampler
+    from apex_ompl.planning.steps import FoundPath as FoundPath
+    from apex_ompl.planning.steps import PlanQuery as PlanQuery
+    from apex_ompl.planning.steps import ProvedPath as ProvedPath
+    from apex_ompl.planning.steps import assemble as assemble
+    from apex_ompl.planning.steps import check as check
+    from apex_ompl.planning.steps import prove as prove
+    from apex_ompl.planning.steps import solve as solve
+    from apex_ompl.planning.steps import time as time
+    from apex_ompl.planning.world import World as World
 
-__all__ = [
-    "FoundPath",
-    "GoalSampler",
-    "MotionPlanner",
-    "PlanQuery",
-    "ProvedPath",
-    "StateCheck",
-    "World",
-    "assemble",
-    "check",
-    "prove",
-    "solve",
-    "time",
-]
-
-_STEPS = ("FoundPath", "PlanQuery", "ProvedPath", "assemble", "check", "prove", "solve", "time")
-
-__getattr__, __dir__ = lazy_names(
+__all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "GoalSampler": "query",
-        "MotionPlanner": "planner",
-        "StateCheck": "planner",
-        "World": "world",
-        **dict.fromkeys(_STEPS, "steps"),
+        "planner": "MotionPlanner StateCheck",
+        "query": "GoalSampler",
+        "steps": "FoundPath PlanQuery ProvedPath assemble check prove solve time",
+        "world": "World",
     },
 )

@@ -14,14 +14,13 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel import Kernel
-from apex_ompl.moving.motion_optimizer import MotionOptimizer
+from apex_ompl.moving.motion_optimizer import InitialMotion, MotionOptimizer, shortest_duration
 from apex_ompl.moving.retime import retime
 from apex_ompl.moving.timed_proof import TimedProver
 from apex_ompl.ompl.setup import assemble
@@ -35,7 +34,6 @@ from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.timed_spline import Start, TimedSpline
-from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
 
 RETIMED, SPACE_TIME, SWEPT = "retiming", "space-time", "swept"
@@ -194,13 +192,13 @@ def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult 
     found = None if best is None else best.trajectory
     given = found
     for factor in FACTORS:
-        for guess in _guesses(among.query, among.limits, motion, turn):
-            duration = factor * 2.0 ** min(turn, LONGER) * guess.duration
+        for initial in _initial_motions(among.query, among.limits, motion, turn):
+            duration = factor * 2.0 ** min(turn, LONGER) * initial.duration
             if among.stop():
                 break
             if found is not None and duration >= found.duration:
                 continue
-            spline = TimedSpline.along(guess.states, duration, _start(among), guess.states[-1])
+            spline = TimedSpline.along(initial.states, duration, _start(among), initial.goal)
             better = optimizer.repair(spline, among.accepts, stop=among.stop)
             if better is not None and (found is None or better.duration < found.duration):
                 found = better
@@ -289,45 +287,28 @@ def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) ->
     )  # fmt: skip
 
 
-class Guess(NamedTuple):
-    """A motion to start from.
-
-    Attributes:
-        states: States evenly spaced in time, shape (N, dof).
-        duration: Its duration [s].
-    """
-
-    states: Array
-    duration: float
-
-
-def _guesses(query: PlanQuery, limits: Limits, motion: Trajectory, turn: int) -> Iterator[Guess]:
+def _initial_motions(query: PlanQuery, limits: Limits, motion: Trajectory, turn: int) -> Iterator[InitialMotion]:
     """Yield motions to start from: the path's own, straight lines, and random perturbations of them.
 
     Args:
         query: The query, among the static obstacles.
         limits: Those of the motion.
         motion: The path's own.
-        turn: Number of times that guesses were asked for before; perturbations become larger.
+        turn: Number of times that they were asked for before; perturbations become larger.
     """
     optimizer, held = Optimizer(), query.setup.held
     if turn == 0:
-        yield Guess(motion(np.linspace(0.0, motion.duration, 256)), motion.duration)
+        states = motion(np.linspace(0.0, motion.duration, 256))
+        yield InitialMotion(states, states[-1], motion.duration, timed=True)
     goals, rng = query.setup.valid_goals, np.random.default_rng([query.setup.seed, turn])
     for goal in goals[np.argsort(np.linalg.norm(goals - query.setup.start, axis=1))][:NEAREST_GOALS]:
         size = PERTURBATION_SIZE * (1 + turn % 3)
         for control in optimizer.starts(query.setup.start, goal, PERTURBATIONS, rng, size):
             control[:, held] = query.setup.start[held]
             states = optimizer.spline.path(control)
-            yield Guess(states, _evenly_paced_duration(states, limits))
+            yield InitialMotion(states, states[-1], shortest_duration(states, limits, even=True))
             if turn > 0:  # aside, back, and then along the line
                 aside = states - optimizer.spline.path(optimizer.spline.line(states[0], goal))
                 line = np.linspace(states[0], goal, len(states))
-                yield Guess(np.concatenate([states[0] + aside, line]), _evenly_paced_duration(line, limits))
-
-
-def _evenly_paced_duration(states: Array, limits: Limits) -> float:
-    """Return about how long a path takes at an even pace of its parameter [s]."""
-    speed = np.abs(np.diff(states, axis=0)) * (len(states) - 1)
-    distance = np.abs(states[-1] - states[0]) / limits.acceleration
-    return float(max((speed / limits.velocity).max(), 2.0 * np.sqrt(distance.max()), 0.1))
+                around = np.concatenate([states[0] + aside, line])
+                yield InitialMotion(around, goal, shortest_duration(line, limits, even=True))

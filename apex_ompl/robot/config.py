@@ -10,10 +10,10 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.errors import MissingFileError
 from apex_ompl.scene.bodies import Body, Name, Quaternion, Vector, located
 from apex_ompl.util.files import is_file
-from apex_ompl.util.schema import StrictModel, read_yaml, validate
+from apex_ompl.util.schema import StrictModel, check_version, read_yaml, validate
 
 SCHEMA = "apex-ompl/robot/1"
 PAIRS_SCHEMA = "apex-ompl/disabled-pairs/1"
@@ -148,8 +148,7 @@ def read_config(path: Path) -> RobotConfig:
         FileFormatError: It does not follow the schema.
     """
     data = read_yaml(path, "robot file")
-    if data.get("schema") != SCHEMA:
-        raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+    check_version(data, SCHEMA, path)
     config = validate(RobotConfig, data, str(path))
     return config.model_copy(update={"fixtures": tuple(located(f, path.parent) for f in config.fixtures)})
 

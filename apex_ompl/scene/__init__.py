@@ -7,33 +7,21 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.scene.bodies import AttachedObject, Obstacle
-    from apex_ompl.scene.points import points_from_depth
-    from apex_ompl.scene.problem import Alignment, Goal, PoseTarget, PoseTolerance, Problem, Tolerance
+    from apex_ompl.scene.bodies import AttachedObject as AttachedObject
+    from apex_ompl.scene.bodies import Obstacle as Obstacle
+    from apex_ompl.scene.points import points_from_depth as points_from_depth
+    from apex_ompl.scene.problem import Alignment as Alignment
+    from apex_ompl.scene.problem import Goal as Goal
+    from apex_ompl.scene.problem import PoseTarget as PoseTarget
+    from apex_ompl.scene.problem import PoseTolerance as PoseTolerance
+    from apex_ompl.scene.problem import Problem as Problem
+    from apex_ompl.scene.problem import Tolerance as Tolerance
 
-__all__ = [
-    "Alignment",
-    "AttachedObject",
-    "Goal",
-    "Obstacle",
-    "PoseTarget",
-    "PoseTolerance",
-    "Problem",
-    "Tolerance",
-    "points_from_depth",
-]
-
-__getattr__, __dir__ = lazy_names(
+__all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "Alignment": "problem",
-        "AttachedObject": "bodies",
-        "Goal": "problem",
-        "Obstacle": "bodies",
-        "PoseTarget": "problem",
-        "PoseTolerance": "problem",
-        "Problem": "problem",
-        "Tolerance": "problem",
-        "points_from_depth": "points",
+        "bodies": "AttachedObject Obstacle",
+        "points": "points_from_depth",
+        "problem": "Alignment Goal PoseTarget PoseTolerance Problem Tolerance",
     },
 )

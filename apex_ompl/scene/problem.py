@@ -20,7 +20,7 @@ from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quatern
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
-from apex_ompl.util.schema import StrictModel, dump_yaml, read_yaml, validate
+from apex_ompl.util.schema import StrictModel, check_version, dump_yaml, read_yaml, validate
 
 SCHEMA = "apex-ompl/problem/1"
 
@@ -254,8 +254,7 @@ class Problem(StrictModel):
         """
         path = Path(path_text(path))
         data = read_yaml(path, "problem file")
-        if data.get("schema") != SCHEMA:
-            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {SCHEMA!r}")
+        check_version(data, SCHEMA, path)
         return cls.parse(data, str(path))._located(path.resolve().parent)
 
     @classmethod

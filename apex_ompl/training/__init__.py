@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.training.records import Paths
-    from apex_ompl.training.store import Store, load
-    from apex_ompl.training.torch_model import load_torch_model
+    from apex_ompl.training.records import Paths as Paths
+    from apex_ompl.training.store import Store as Store
+    from apex_ompl.training.store import load as load
+    from apex_ompl.training.torch_model import load_torch_model as load_torch_model
 
-__all__ = ["Paths", "Store", "load", "load_torch_model"]
-
-__getattr__, __dir__ = lazy_names(
-    __name__, {"Paths": "records", "Store": "store", "load": "store", "load_torch_model": "torch_model"}
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__, {"records": "Paths", "store": "Store load", "torch_model": "load_torch_model"}
 )

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, model_validator
 
-from apex_ompl.errors import FileFormatError
 from apex_ompl.model.config import (
     ConditionConfig,
     Count,
@@ -18,7 +17,7 @@ from apex_ompl.model.config import (
     NoiseConfig,
     SamplingConfig,
 )
-from apex_ompl.util.schema import StrictModel, read_yaml, replaced, validate
+from apex_ompl.util.schema import StrictModel, check_version, read_yaml, replaced, validate
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0)]
@@ -86,8 +85,7 @@ class TrainingFile(StrictModel):
         """
         data = read_yaml(Path(path), "training configuration")
         (schema,) = get_args(cls.model_fields["schema_"].annotation)
-        if data.get("schema") != schema:
-            raise FileFormatError(str(path), "schema", data.get("schema"), f"expected {schema!r}")
+        check_version(data, schema, path)
         return validate(cls, replaced(data, changes or {}, str(path)), str(path))
 
 

@@ -11,17 +11,18 @@ from apex_ompl.util.forking import unforked
 
 
 def lazy_names(
-    package: str, homes: Mapping[str, str], others: tuple[str, ...] = ()
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return ``__getattr__`` and ``__dir__`` of a package whose import costs nothing.
+    package: str, names: Mapping[str, str], others: tuple[str, ...] = ()
+) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__all__``, ``__getattr__`` and ``__dir__`` of a package whose import costs nothing.
 
-    The package lists the names in ``__all__``, and imports them for type checkers under ``TYPE_CHECKING``.
+    For type checkers, the package imports each name as itself under ``TYPE_CHECKING``.
 
     Args:
         package: Name of the package.
-        homes: Public name -> module below the package that has it.
+        names: Module below the package -> public names that it has, with spaces between them.
         others: Names that ``dir`` lists besides ``__all__``.
     """
+    homes = {name: module for module, its_names in names.items() for name in its_names.split()}
 
     def __getattr__(name: str) -> Any:
         if name not in homes:
@@ -31,6 +32,6 @@ def lazy_names(
         return vars(sys.modules[package]).setdefault(name, found)
 
     def __dir__() -> list[str]:
-        return sorted([*vars(sys.modules[package])["__all__"], *others])
+        return sorted([*homes, *others])
 
-    return __getattr__, __dir__
+    return sorted(homes), __getattr__, __dir__

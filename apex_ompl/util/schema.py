@@ -279,6 +279,29 @@ def read_json(path: Path, role: str) -> dict[str, Any]:
     return data
 
 
+def check_version(data: Mapping[str, Any], schema: str, source: object) -> None:
+    """Check that the content of a file names the version ``schema`` of its format; ``source`` is the file, for errors.
+
+    Raises:
+        FileFormatError: It names another one, or none.
+    """
+    if data.get("schema") != schema:
+        raise FileFormatError(str(source), "schema", data.get("schema"), f"expected {schema!r}")
+
+
+def read_record(path: Path, kind: type[ModelT], role: str) -> ModelT:
+    """Read a JSON file as a record, whose field ``schema_`` has the only version that is read.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: It is not JSON, of another version, or does not follow the schema.
+    """
+    data = read_json(path, role)
+    (schema,) = get_args(kind.model_fields["schema_"].annotation)
+    check_version(data, schema, path)
+    return validate(kind, data, str(path))
+
+
 def yaml_value(text: str) -> Any:
     """Return the value that YAML text stands for, as files of this package are read.
 

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from apex_ompl.viz.viewer.run import ShownRun
+    from apex_ompl.viz.viewer.run import ShownRun as ShownRun
 
-__all__ = ["ShownRun"]
-
-__getattr__, __dir__ = lazy_names(__name__, {"ShownRun": "viewer.run"})
+__all__, __getattr__, __dir__ = lazy_names(__name__, {"viewer.run": "ShownRun"})

@@ -179,8 +179,8 @@ def controls(name: str, found: dict[str, list[float]]) -> None:
     _, initial = next(factors.initial_motions(search))
     graph = factors.problem(search, initial.duration)
     started = factors.supports(search, initial, initial.duration)
-    count = graph.maximum(started, factors.iterations, 0.0).evaluations * len(graph.times)
-    found[WORK].append(fastest(lambda: graph.maximum(started, factors.iterations, 0.0)) / count)
+    count = graph.maximum(started, factors.parameters.iterations, 0.0).evaluations * len(graph.times)
+    found[WORK].append(fastest(lambda: graph.maximum(started, factors.parameters.iterations, 0.0)) / count)
     step = DynamicRRTReplanner().search.step
     tree = GoalTree(context.goals, step, 200)
     while not tree.full:

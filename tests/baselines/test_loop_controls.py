@@ -10,7 +10,7 @@ from loops import PROBLEM, crossing, go, setup_of
 
 from apex_ompl import run
 from apex_ompl.baselines.control.mppi import softmax
-from apex_ompl.baselines.control.potential_field import Field, PotentialField, repulsive
+from apex_ompl.baselines.control.potential_field import PotentialField, repulsive
 from apex_ompl.baselines.control.short_horizon import Horizon
 from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.result import Outcome
@@ -90,19 +90,20 @@ def test_the_force_is_the_slope_of_the_potential() -> None:
     palm = setup.robot.link_pose(setup.start, "left_hand_palm")[:3, 3]
     box = Obstacle(name="box", box=(0.1, 0.1, 0.1), position=tuple((palm + (0.0, 0.0, 0.2)).tolist()))
     dynamic, kernel, reflex = DynamicObstacles([box]), setup.checker.kernel, PotentialField()
-    field, near = replace(reflex, reach=0.4).field(goal), replace(reflex, own_reach=0.3).field(goal)
+    far, near = replace(reflex, reach=0.4), replace(reflex, own_reach=0.3)
     repelled, matching = 0, 0
     for k in range(40):
-        one: Field = (field, near)[k % 2]
+        one = (far, near)[k % 2]
         q = (setup.start if k % 4 < 2 else goal) + 0.05 * rng.normal(size=len(goal))
         q[-2:] = goal[-2:]
-        _, force = one.potential_and_force(kernel, dynamic, q, 0.0)
+        _, force = one.potential_and_force(kernel, dynamic, goal, q, 0.0)
         way = rng.normal(size=len(q))
         way[-2:] = 0.0
-        ends = [one.potential_and_force(kernel, dynamic, q + s * way, 0.0)[0] for s in (1e-6, -1e-6)]
+        ends = [one.potential_and_force(kernel, dynamic, goal, q + s * way, 0.0)[0] for s in (1e-6, -1e-6)]
         slope = (ends[0] - ends[1]) / 2e-6
         matching += abs(slope + force @ way) <= 1e-3 * max(1.0, abs(slope))
-        attracted = one._replace(repulsion=0.0, own_repulsion=0.0).potential_and_force(kernel, dynamic, q, 0.0)[1]
+        attracting = replace(one, repulsion=0.0, own_repulsion=0.0)
+        attracted = attracting.potential_and_force(kernel, dynamic, goal, q, 0.0)[1]
         repelled += not np.allclose(force, attracted)
     assert repelled >= 20
     assert matching >= 38  # where two spheres are as near the gradient is that of one

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, curve_of, prove_motion
-from apex_ompl.moving.motion_optimizer import MotionOptimizer, MotionSettings, _grid
+from apex_ompl.moving.motion_optimizer import MotionOptimizer, MotionSettings, _grid, shortest_duration
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Trajectory
@@ -20,6 +20,17 @@ from apex_ompl.timing.timed_spline import Start, TimedSpline
 @pytest.fixture(scope="module")
 def bare(robot: Robot) -> CollisionChecker:
     return CollisionChecker(robot)
+
+
+def test_shortest_duration_of_a_detour_and_at_an_even_pace(robot: Robot) -> None:
+    """Joint 0 goes 0.6 rad ahead in two steps and 0.2 rad back in one."""
+    states = np.tile(robot.home, (4, 1))
+    states[:, 0] = 0.0, 0.5, 0.6, 0.4
+    speed, acceleration = robot.limits.velocity[0], robot.limits.acceleration[0]
+    ramps = 2.0 * np.sqrt(0.4 / acceleration)
+    assert shortest_duration(states, robot.limits) == pytest.approx(max(0.8 / speed, ramps, 0.1))
+    assert shortest_duration(states, robot.limits, even=True) == pytest.approx(max(3 * 0.5 / speed, ramps, 0.1))
+    assert shortest_duration(states[:1].repeat(2, axis=0), robot.limits) == 0.1
 
 
 def ends(robot: Robot) -> tuple[np.ndarray, np.ndarray]:

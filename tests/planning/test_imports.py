@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +26,7 @@ LARGE = (
     "trimesh",
     "yaml",
 )
+PACKAGES = ("apex", "loop", "model", "moving", "ompl", "paths", "planning", "scene", "training", "viz")
 HELP = "import sys; from apex_ompl.cli import main\ntry: main(['{}'])\nexcept SystemExit: pass\n"
 
 
@@ -60,14 +63,7 @@ def test_a_plan_imports_neither_torch_nor_other_planners() -> None:
     assert loaded(code, ("matplotlib", "torch", "trimesh", *others)) == []
 
 
-@pytest.mark.parametrize(
-    "package",
-    [
-        "apex_ompl",
-        *(f"apex_ompl.{name}" for name in ("apex", "loop", "model", "moving", "ompl", "paths", "planning")),
-        *(f"apex_ompl.{name}" for name in ("scene", "training", "viz")),
-    ],
-)
+@pytest.mark.parametrize("package", ["apex_ompl", *(f"apex_ompl.{name}" for name in PACKAGES)])
 def test_public_names_are_those_of_their_modules(package: str) -> None:
     module = importlib.import_module(package)
     assert set(module.__all__) <= set(dir(module))
@@ -79,9 +75,20 @@ def test_public_names_are_those_of_their_modules(package: str) -> None:
         module.plans  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    "package", ["apex", "loop", "model", "moving", "ompl", "paths", "planning", "scene", "training", "viz"]
-)
+@pytest.mark.parametrize("package", ["apex_ompl", *(f"apex_ompl.{name}" for name in PACKAGES)])
+def test_type_checkers_see_the_public_names(package: str) -> None:
+    module = importlib.import_module(package)
+    body = ast.parse(Path(str(module.__file__)).read_text()).body
+    imports = [
+        line for block in body if isinstance(block, ast.If) for line in block.body if isinstance(line, ast.ImportFrom)
+    ]
+    seen = [(str(line.module), name.name, name.asname) for line in imports for name in line.names]
+    assert sorted(name for _, name, _ in seen) == module.__all__
+    for home, name, alias in seen:
+        assert alias == name and getattr(importlib.import_module(home), name) is getattr(module, name)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
 def test_packages_cost_nothing_before_a_name_of_theirs_is_used(package: str) -> None:
     assert loaded(f"import apex_ompl.{package}; dir(apex_ompl.{package})", (*LARGE, "numpy")) == []
 
@@ -91,5 +98,5 @@ def test_the_planner_says_what_its_types_are() -> None:
     from apex_ompl.planning import planner
 
     assert apex_ompl.MotionPlanner is planner.MotionPlanner and callable(planner.kept_planner)
-    get, _ = lazy_names("apex_ompl.planning", {"World": "world"})
+    _, get, _ = lazy_names("apex_ompl.planning", {"world": "World"})
     assert get("World").__module__ == "apex_ompl.planning.world"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,68 +11,11 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, clearance_in_time
-from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
+from apex_ompl.moving.replanner import ONE_PLAN, Answer, Replanner, Request, register
 from apex_ompl.moving.search import Search
 from apex_ompl.types import Array
 
 LEAST = 0.25  # clearance below which the potential is linear, as a share of the reach
-
-
-class Field(NamedTuple):
-    """A potential in joint space: attracted by a goal, repelled by obstacles (Khatib 1986).
-
-    The attractive part is ``attraction * |q - goal|^2 / 2``, and a cone beyond the distance ``cone``. The repulsive
-    parts are ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: to dynamic obstacles, to static
-    obstacles, and of the robot to itself. The last two fade with the square of the distance to the goal inside the
-    cone, so that a goal close to contact is a minimum (Ge and Cui 2000).
-
-    Attributes:
-        goal: Shape (dof,).
-        attraction: Gain [1/s^2].
-        cone: Distance to the goal beyond which its force is constant [rad].
-        repulsion: Gain for dynamic obstacles [rad^2/s^2].
-        own_repulsion: Gain for static obstacles and the robot itself [rad^2/s^2].
-        reach: Clearance to dynamic obstacles below which they repel [m].
-        own_reach: Clearance to static obstacles and of the robot to itself below which they repel [m].
-    """
-
-    goal: Array
-    attraction: float
-    cone: float
-    repulsion: float
-    own_repulsion: float
-    reach: float
-    own_reach: float
-
-    def potential_and_force(
-        self, kernel: Kernel, dynamic: DynamicObstacles, q: Array, time: float
-    ) -> tuple[float, Array]:
-        """Return the potential [rad^2/s^2] at a state, shape (dof,), and its force, shape (dof,) [rad/s^2].
-
-        Args:
-            kernel: The robot among static obstacles.
-            dynamic: The dynamic obstacles.
-            q: The state.
-            time: Time of the dynamic obstacles' stamps [s].
-        """
-        way = q - self.goal
-        distance = float(np.linalg.norm(way))
-        inside = min(distance, self.cone)
-        potential = self.attraction * inside * (distance - 0.5 * inside)
-        force = -self.attraction * way * (inside / max(distance, 1e-12))
-        moving, slope = clearance_in_time(kernel, dynamic, q[None], np.array([time]), self.reach)
-        values, slopes = kernel.clearance_gradient(q, self.own_reach)
-        fade, fading = (inside / self.cone) ** 2, 2.0 * way / self.cone**2 * (distance < self.cone)
-        for clearance, gradient, reach, gain, share, sharing in (
-            (moving[0], slope[0, :-1], self.reach, self.repulsion, 1.0, 0.0),
-            (values[0, 0], slopes[0, 0], self.own_reach, self.own_repulsion, fade, fading),
-            (values[0, 1], slopes[0, 1], self.own_reach, self.own_repulsion, fade, fading),
-        ):
-            if clearance < reach:
-                height, steepness = repulsive(clearance / reach)
-                potential += gain * share * height
-                force = force + gain * (share * steepness / reach * gradient - sharing * height)
-        return potential, force
 
 
 def repulsive(share: float) -> tuple[float, float]:
@@ -84,7 +26,7 @@ def repulsive(share: float) -> tuple[float, float]:
 
 
 @dataclass(eq=False)
-class PotentialField:
+class PotentialField(Replanner):
     """A reflex: damped descent of an artificial potential (Khatib 1986) over a short horizon.
 
     Obstacles repel from their predicted places at the time of each step. The horizon, or a part of it, is followed by a
@@ -95,7 +37,7 @@ class PotentialField:
         steps: Number of steps of the horizon, including the stop at its end.
         step: Time of a step [s].
         damping: Damping of the speed [1/s].
-        attraction: Gain of the attraction, see :class:`Field` [1/s^2].
+        attraction: Gain of the attraction [1/s^2].
         cone: Distance to the goal beyond which its force is constant [rad].
         repulsion: Gain of the repulsion by dynamic obstacles [rad^2/s^2].
         own_repulsion: Gain of the repulsion by static obstacles and by the robot itself [rad^2/s^2].
@@ -117,9 +59,6 @@ class PotentialField:
     counts: tuple[int, ...] = (14, 8)
     near: float = 0.5
 
-    def prepare(self, context: RunContext) -> None:
-        """Nothing is needed."""
-
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Answer:
         """Return the motion down the potential, or a straight one to a near goal."""
         search = Search(context, request, budget)
@@ -131,18 +70,51 @@ class PotentialField:
             motion, part = first_proved(search, horizon, self.controls(search, horizon), self.counts), "field"
         return Answer(None if motion is None else search.following(motion), part, budget)
 
-    def field(self, goal: Array) -> Field:
-        """Return the potential with a goal, shape (dof,)."""
-        return Field(goal, self.attraction, self.cone, self.repulsion, self.own_repulsion, self.reach, self.own_reach)
+    def potential_and_force(
+        self, kernel: Kernel, dynamic: DynamicObstacles, goal: Array, q: Array, time: float
+    ) -> tuple[float, Array]:
+        """Return the potential [rad^2/s^2] at a state, shape (dof,), and its force, shape (dof,) [rad/s^2].
+
+        The robot is attracted by the goal, and repelled by obstacles (Khatib 1986). The attractive part is
+        ``attraction * |q - goal|^2 / 2``, and a cone beyond the distance ``cone``. The repulsive parts are
+        ``repulsion * (reach / d - 1)^2 / 2`` for clearances d below the reach: to dynamic obstacles, to static
+        obstacles, and of the robot to itself. The last two fade with the square of the distance to the goal inside the
+        cone, so that a goal close to contact is a minimum (Ge and Cui 2000).
+
+        Args:
+            kernel: The robot among static obstacles.
+            dynamic: The dynamic obstacles.
+            goal: The goal, shape (dof,).
+            q: The state.
+            time: Time of the dynamic obstacles' stamps [s].
+        """
+        way = q - goal
+        distance = float(np.linalg.norm(way))
+        inside = min(distance, self.cone)
+        potential = self.attraction * inside * (distance - 0.5 * inside)
+        force = -self.attraction * way * (inside / max(distance, 1e-12))
+        moving, slope = clearance_in_time(kernel, dynamic, q[None], np.array([time]), self.reach)
+        values, slopes = kernel.clearance_gradient(q, self.own_reach)
+        fade, fading = (inside / self.cone) ** 2, 2.0 * way / self.cone**2 * (distance < self.cone)
+        for clearance, gradient, reach, gain, share, sharing in (
+            (moving[0], slope[0, :-1], self.reach, self.repulsion, 1.0, 0.0),
+            (values[0, 0], slopes[0, 0], self.own_reach, self.own_repulsion, fade, fading),
+            (values[0, 1], slopes[0, 1], self.own_reach, self.own_repulsion, fade, fading),
+        ):
+            if clearance < reach:
+                height, steepness = repulsive(clearance / reach)
+                potential += gain * share * height
+                force = force + gain * (share * steepness / reach * gradient - sharing * height)
+        return potential, force
 
     def controls(self, search: Search, horizon: Horizon) -> Array:
         """Return the accelerations down the potential, shape (K, dof) [rad/s^2]."""
         context, request = search.context, search.request
-        field, fingers = self.field(search.goals[0]), context.fingers
+        goal, fingers = search.goals[0], context.fingers
 
         def control(k: int, speed: Array, at: Array) -> Array:
             time = request.join + (k + 1) * self.step
-            _, force = field.potential_and_force(context.kernel, request.predicted, at[0], time)
+            _, force = self.potential_and_force(context.kernel, request.predicted, goal, at[0], time)
             force[fingers] = 0.0
             search.budget.spend("force")
             return force - self.damping * speed

@@ -14,7 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from apex_ompl.moving.search import Search, shortest_duration
+from apex_ompl.moving.motion_optimizer import shortest_duration
+from apex_ompl.moving.search import Search
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.timing.spline_method import least_knot_spacing, start_points

@@ -14,21 +14,20 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_arrays
 from safetensors.numpy import save as save_arrays
 
 from apex_ompl.baselines import weights_folder
 from apex_ompl.baselines.damon.lazy_search import Graph
 from apex_ompl.errors import FileFormatError, MissingFileError
+from apex_ompl.model.checkpoint import CONFIG, WEIGHTS, FolderCache, read_weights
 from apex_ompl.types import Array, Indices
-from apex_ompl.util.files import is_file, make_folder, read_file, write_atomically
-from apex_ompl.util.schema import StrictModel, read_json, validate
+from apex_ompl.util.files import is_file, make_folder, write_atomically
+from apex_ompl.util.schema import StrictModel, read_record
 
 LAYERS = ("encoder.0", "encoder.2", "encoder.4", "decoder.0", "decoder.2", "decoder.4")
 """Names of the dense layers, as those of :class:`apex_ompl.baselines.damon.manifold_training.StateNetwork`."""
 SCHEMA = "apex-ompl/manifold/1"
-CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
+CARD = "README.md"
 MADE_BY = "python scripts/train_damon.py"
 DECODED, STORED = "decoded", "stored"
 MOST_NODES = 65_535  # edges are stored in 16 bits
@@ -199,21 +198,11 @@ def load_manifold(name: str, robot: str | None = None) -> Manifold:
         FileFormatError: It is damaged, of another version, or for another robot.
     """
     folder = folder_of(name)
-    data = read_json(folder / CONFIG, "configuration of a manifold")
-    if data.get("schema") != SCHEMA:
-        raise FileFormatError(str(folder / CONFIG), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-    config = validate(ManifoldConfig, data, str(folder / CONFIG))
+    config = read_record(folder / CONFIG, ManifoldConfig, "configuration of a manifold")
     if robot is not None and config.robot != robot:
         raise FileFormatError(str(folder / CONFIG), "robot", config.robot, f"expected {robot!r}")
     source = folder / WEIGHTS
-    content = read_file(source, "weights of a manifold")
-    found = hashlib.sha256(content).hexdigest()
-    if found != config.digest:
-        raise FileFormatError(str(source), "", f"SHA-256 {found[:12]}...", f"expected {config.digest[:12]}...: damaged")
-    try:
-        arrays = load_arrays(content)
-    except (SafetensorError, ValueError, KeyError) as error:
-        raise FileFormatError(str(source), "", str(error), "expected safetensors") from error
+    arrays = read_weights(source, config.digest, "weights of a manifold")
     fault = _fault(arrays, config)
     if fault:
         raise FileFormatError(str(source), fault, "values that do not fit", f"expected arrays that fit {CONFIG}")
@@ -229,15 +218,10 @@ def shared_manifold(name: str, robot: str | None = None) -> Manifold:
     Raises:
         ApexError: As :func:`load_manifold` does.
     """
-    files = [folder_of(name) / file for file in (CONFIG, WEIGHTS)]
-    stamp = tuple(file.stat().st_mtime_ns for file in files if is_file(file))
-    return _shared(str(files[0].parent.absolute()), robot, stamp)
+    return _shared(folder_of(name), robot=robot)
 
 
-@lru_cache(maxsize=4)
-def _shared(folder: str, robot: str | None, stamp: tuple[int, ...]) -> Manifold:
-    del stamp
-    return load_manifold(folder, robot)
+_shared = FolderCache(load_manifold)
 
 
 @lru_cache(maxsize=4)

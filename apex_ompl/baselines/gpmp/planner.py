@@ -14,10 +14,10 @@ from ompl import util as ou
 
 from apex_ompl.apex.path_validator import NOT_ACCEPTED, PathValidator
 from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
-from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Optimum
-from apex_ompl.collision import CollisionChecker
+from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Factors, Optimum
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.kernel.path import ClearanceCosts, clearance_costs
+from apex_ompl.kernel import Kernel
+from apex_ompl.kernel.path import NO_DYNAMIC_OBSTACLES, ClearanceCosts, clearance_costs
 from apex_ompl.ompl.own_planner import OwnPlanner, nearest_pairs
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.space import bounds_of
@@ -51,6 +51,7 @@ class GaussianProcessParameters(Parameters):
 
     smooth: ClassVar[bool] = True
     name: ClassVar[str]
+    kind: ClassVar[type[Factors]]
     intervals: int = bounded(12, 2, 200)
     checked: int = bounded(6, 1, 100)
     safety_distance: float = bounded(0.08, 1e-4, 1.0, unit="m")
@@ -65,26 +66,37 @@ class GaussianProcessParameters(Parameters):
 
     @abstractmethod
     def optimum(
-        self, problem: Any, supports: Array, is_valid: Callable[[Array], bool], stop: Callable[[], bool]
+        self, problem: Any, supports: Array, stop: Callable[[], bool], is_valid: Callable[[Array], bool] | None = None
     ) -> Optimum:
-        """Return what the method makes of initial supports, shape (intervals + 1, 2, dof)."""
+        """Return what the method makes of initial supports.
 
-    @abstractmethod
+        Args:
+            problem: What :meth:`problem` returned.
+            supports: Initial supports, shape (intervals + 1, 2, dof).
+            stop: Asked before each step whether to end.
+            is_valid: Whether a path without a contact ends the iterations of GPMP; by default each does.
+        """
+
     def problem(
-        self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
-    ) -> FactorGraph | CostFunctional:
-        """Return what is optimized."""
+        self, process: GaussianProcess, kernel: Kernel, lower: Array, upper: Array, *, start_time: float = 0.0,
+        dynamic: tuple[Any, ...] = NO_DYNAMIC_OBSTACLES,
+    ) -> Factors:  # fmt: skip
+        """Return what is optimized.
 
-    def factors(
-        self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
-    ) -> tuple[Any, ...]:
-        """Return what :class:`apex_ompl.baselines.gpmp.optimizer.Factors` takes."""
-        kernel, scene, own = checker.kernel, self.safety_distance, self.own_distance
+        Args:
+            process: The prior.
+            kernel: The robot among static obstacles.
+            lower: Lowest positions, shape (dof,).
+            upper: Highest positions, shape (dof,).
+            start_time: When the motion starts [s].
+            dynamic: Dynamic obstacles, packed as :class:`apex_ompl.kernel.arrays.DynamicArrays`.
+        """
 
         def clearances(states: Array, times: Array) -> ClearanceCosts:
-            return clearance_costs(kernel, states, scene, own)
+            return clearance_costs(kernel, states, self.safety_distance, self.own_distance, start_time + times, dynamic)
 
-        return process, clearances, lower, upper, self.checked, (scene / self.obstacle_sigma) ** 2
+        weight = (self.safety_distance / self.obstacle_sigma) ** 2
+        return self.kind(process, clearances, lower, upper, self.checked, weight)
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner.
@@ -117,6 +129,7 @@ class GPMP(GaussianProcessParameters):
     """
 
     name: ClassVar[str] = "gpmp"
+    kind: ClassVar[type[Factors]] = CostFunctional
     safety_distance: float = bounded(TUNED["gpmp"]["safety_distance"], 1e-4, 1.0, unit="m")
     obstacle_sigma: float = bounded(TUNED["gpmp"]["obstacle_sigma"], 1e-6, 10.0, unit="m")
     intervals: int = bounded(TUNED["gpmp"]["intervals"], 2, 200)
@@ -125,24 +138,20 @@ class GPMP(GaussianProcessParameters):
     rate: float = bounded(1.0, 1e-9, 1.0)
     largest_step: float = bounded(0.3, 1e-6, 10.0, unit="rad")
 
-    def problem(
-        self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array
-    ) -> CostFunctional:
-        """Return the cost functional."""
-        return CostFunctional(*self.factors(process, checker, lower, upper))
-
     def optimum(
-        self, problem: CostFunctional, supports: Array, is_valid: Callable[[Array], bool], stop: Callable[[], bool]
+        self, problem: Any, supports: Array, stop: Callable[[], bool], is_valid: Callable[[Array], bool] | None = None
     ) -> Optimum:
         """Return what steps along the functional gradient come to."""
 
         def accepts(supports: Array, found: Evaluation) -> bool:
-            return found.clearance.min() > 0.0 and is_valid(problem.path(supports, STATES))
+            free = bool(found.clearance.min() > 0.0)
+            return free and (is_valid is None or is_valid(problem.path(supports, STATES)))
 
-        return problem.minimum(
+        optimum: Optimum = problem.minimum(
             supports, self.iterations, self.tolerance, rate=self.rate, largest=self.largest_step, accepts=accepts,
             stop=stop,
         )  # fmt: skip
+        return optimum
 
 
 @register("gpmp2")
@@ -163,20 +172,18 @@ class GPMP2(GaussianProcessParameters):
     """
 
     name: ClassVar[str] = "gpmp2"
+    kind: ClassVar[type[Factors]] = FactorGraph
     safety_distance: float = bounded(TUNED["gpmp2"]["safety_distance"], 1e-4, 1.0, unit="m")
     obstacle_sigma: float = bounded(TUNED["gpmp2"]["obstacle_sigma"], 1e-6, 10.0, unit="m")
     intervals: int = bounded(TUNED["gpmp2"]["intervals"], 2, 200)
     power: float = bounded(TUNED["gpmp2"]["power"], 1e-9, 1e9, unit="rad^2/s^3")
 
-    def problem(self, process: GaussianProcess, checker: CollisionChecker, lower: Array, upper: Array) -> FactorGraph:
-        """Return the factor graph."""
-        return FactorGraph(*self.factors(process, checker, lower, upper))
-
     def optimum(
-        self, problem: FactorGraph, supports: Array, is_valid: Callable[[Array], bool], stop: Callable[[], bool]
+        self, problem: Any, supports: Array, stop: Callable[[], bool], is_valid: Callable[[Array], bool] | None = None
     ) -> Optimum:
         """Return the maximum of the posterior."""
-        return problem.maximum(supports, self.iterations, self.tolerance, stop=stop)
+        optimum: Optimum = problem.maximum(supports, self.iterations, self.tolerance, stop=stop)
+        return optimum
 
 
 class GaussianProcessPlanner(OwnPlanner):
@@ -215,13 +222,13 @@ class GaussianProcessPlanner(OwnPlanner):
         if status is not None:
             return status
         process = GaussianProcess(self.parameters.intervals, power=self.parameters.power)
-        problem = self.parameters.problem(process, checker, lower, upper)
+        problem = self.parameters.problem(process, checker.kernel, lower, upper)
         for supports in self._initial(process, nearest_pairs(starts, goals)):
             if ptc():
                 break
             report.candidates += 1
             with report.timed("optimize"):
-                optimum = self.parameters.optimum(problem, supports, validator.is_valid, lambda: bool(ptc()))
+                optimum = self.parameters.optimum(problem, supports, lambda: bool(ptc()), validator.is_valid)
             self.optima.append(optimum)
             report.steps += optimum.evaluations
             path = Path(problem.path(optimum.supports, STATES))

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from apex_ompl.baselines.gpmp.gaussian_process import GaussianProcess
-from apex_ompl.baselines.gpmp.optimizer import CostFunctional, Evaluation, FactorGraph, Factors, Optimum
+from apex_ompl.baselines.gpmp.optimizer import Factors
 from apex_ompl.baselines.gpmp.planner import GPMP, GPMP2, GaussianProcessParameters
-from apex_ompl.kernel.path import ClearanceCosts, clearance_costs
+from apex_ompl.kernel.path import clearance_costs
 from apex_ompl.moving.compute_costs import ComputeBudget
 from apex_ompl.moving.context import RunContext
+from apex_ompl.moving.motion_optimizer import InitialMotion, shortest_duration
 from apex_ompl.moving.replanner import ONE_PLAN, Answer, Request, register
-from apex_ompl.moving.search import STATES, InitialMotion, Search, rest_of_route, shortest_duration
+from apex_ompl.moving.search import STATES, Search, rest_of_route
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline
@@ -44,14 +44,12 @@ class IncrementalGPMP2:
     Attributes:
         parameters: Parameters of the planner.
         factors: Durations that are tried, as multiples of the shortest one without obstacles.
-        iterations: Largest number of motions that are tried in a round.
         rounds: Largest number of rounds, between which a motion gets more time.
         goals: Number of goals of straight lines.
     """
 
-    parameters: GaussianProcessParameters = GPMP2(intervals=10, checked=4, tolerance=1e-2)
+    parameters: GaussianProcessParameters = GPMP2(intervals=10, checked=4, iterations=8, tolerance=1e-2)
     factors: tuple[float, ...] = (1.1, 1.8)
-    iterations: int = 8
     rounds: int = 4
     goals: int = 2
 
@@ -85,7 +83,7 @@ class IncrementalGPMP2:
         supports, limits = self.supports(search, initial, duration), search.context.limits
         for _ in range(self.rounds):
             problem = self.problem(search, duration)
-            best = self.optimum(problem, supports, search.budget.over)
+            best = self.parameters.optimum(problem, supports, search.budget.over)
             search.budget.spend(WORK, best.evaluations * len(problem.times))
             search.budget.spend("straight motion")
             spline = spline_of(problem, best.supports, search.start)
@@ -113,26 +111,14 @@ class IncrementalGPMP2:
         velocities[0], velocities[-1] = search.start.velocity, 0.0
         return np.stack([positions, velocities], axis=1)
 
-    def problem(self, search: Search, duration: float) -> Any:
-        """Return the factor graph of motions of a duration [s]."""
-        return FactorGraph(*self.terms(search, duration))
-
-    def optimum(self, problem: Any, supports: Array, stop: Callable[[], bool]) -> Optimum:
-        """Return the optimum from some supports."""
-        found: Optimum = problem.maximum(supports, self.iterations, self.parameters.tolerance, stop=stop)
-        return found
-
-    def terms(self, search: Search, duration: float) -> tuple[Any, ...]:
-        """Return the arguments of :class:`apex_ompl.baselines.gpmp.optimizer.Factors` for a duration [s]."""
-        p, request, kernel, limits = self.parameters, search.request, search.context.kernel, search.context.limits
+    def problem(self, search: Search, duration: float) -> Factors:
+        """Return what is optimized for motions of a duration [s]."""
+        p, request, limits = self.parameters, search.request, search.context.limits
         process = GaussianProcess(p.intervals, duration, p.power / duration**3)
-
-        def clearances(states: Array, times: Array) -> ClearanceCosts:
-            return clearance_costs(
-                kernel, states, p.safety_distance, p.own_distance, request.join + times, request.predicted.packed
-            )
-
-        return process, clearances, limits.lower, limits.upper, p.checked, (p.safety_distance / p.obstacle_sigma) ** 2
+        return p.problem(
+            process, search.context.kernel, limits.lower, limits.upper, start_time=request.join,
+            dynamic=request.predicted.packed,
+        )  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -144,24 +130,7 @@ class IncrementalGPMP(IncrementalGPMP2):
     validation worlds.
     """
 
-    parameters: GPMP = GPMP(intervals=10, checked=4, tolerance=1e-3)
-    iterations: int = 20
-
-    def problem(self, search: Search, duration: float) -> Any:
-        """Return the cost functional of motions of a duration [s]."""
-        return CostFunctional(*self.terms(search, duration))
-
-    def optimum(self, problem: Any, supports: Array, stop: Callable[[], bool]) -> Optimum:
-        """Return the optimum from some supports."""
-        p = self.parameters
-
-        def accepts(supports: Array, found: Evaluation) -> bool:
-            return bool(found.clearance.min() > 0.0)
-
-        found: Optimum = problem.minimum(
-            supports, self.iterations, p.tolerance, rate=p.rate, largest=p.largest_step, accepts=accepts, stop=stop
-        )
-        return found
+    parameters: GPMP = GPMP(intervals=10, checked=4, iterations=20, tolerance=1e-3)
 
 
 def spline_of(problem: Factors, supports: Array, start: Start) -> TimedSpline:

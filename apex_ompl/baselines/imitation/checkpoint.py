@@ -18,7 +18,7 @@ from apex_ompl.errors import FileFormatError, MissingFileError
 from apex_ompl.model.checkpoint import CONFIG, WEIGHTS, check_shapes, read_weights
 from apex_ompl.training.torch_model import write_checkpoint
 from apex_ompl.util.files import is_file
-from apex_ompl.util.schema import StrictModel, read_json, validate
+from apex_ompl.util.schema import StrictModel, read_record
 
 SCHEMA = "apex-ompl/imitation/1"
 ROLE = "file of an imitation policy"
@@ -92,10 +92,7 @@ def load_policy_network(
         if not is_file(folder / file):
             raise MissingFileError(str(folder / file), ROLE)
     source = folder / CONFIG
-    data = read_json(source, ROLE)
-    if data.get("schema") != SCHEMA:
-        raise FileFormatError(str(source), "schema", data.get("schema"), f"expected {SCHEMA!r}")
-    config = validate(PolicyConfig, data, str(source))
+    config = read_record(source, PolicyConfig, ROLE)
     if robot is not None and config.robot != robot:
         raise FileFormatError(str(source), "robot", config.robot, f"expected {robot!r}")
     if len(config.joints) != config.network.dof:

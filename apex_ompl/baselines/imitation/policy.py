@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,11 @@ from apex_ompl.baselines.imitation.data import NO_PROBES
 from apex_ompl.baselines.imitation.network import PolicyNetwork
 from apex_ompl.errors import MissingFileError
 from apex_ompl.kernel import Kernel
-from apex_ompl.model.checkpoint import CONFIG, WEIGHTS
+from apex_ompl.model.checkpoint import CONFIG, FolderCache
 from apex_ompl.model.query import Query
 from apex_ompl.training.conditions import batch_queries
 from apex_ompl.types import Array
 from apex_ompl.util.files import is_file
-from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.process import one_torch_thread
 
 EXECUTED = 8  # states of a chunk that are followed before the policy is asked again
@@ -137,16 +135,7 @@ def shared_policy(name: str | os.PathLike[str], *, robot: str | None = None) -> 
         MissingFileError: There is no policy, or a file of it is missing.
         FileFormatError: It is damaged, of another version, or for another robot.
     """
-    folder = policy_folder(name)
-    stamp = tuple(path.stat().st_mtime_ns for file in (CONFIG, WEIGHTS) if is_file(path := folder / file))
-    with _loading:
-        return _shared(str(folder.absolute()), stamp, robot)
+    return _shared(policy_folder(name), robot=robot)
 
 
-_loading = ProcessLock()
-
-
-@lru_cache(maxsize=4)
-def _shared(folder: str, stamp: tuple[int, ...], robot: str | None) -> ImitationPolicy:
-    del stamp
-    return ImitationPolicy(*load_policy_network(folder, robot=robot))
+_shared = FolderCache(lambda folder, robot: ImitationPolicy(*load_policy_network(folder, robot=robot)))

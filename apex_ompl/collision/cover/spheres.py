@@ -23,7 +23,8 @@ from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
 from apex_ompl.util.cache import weakly_cached
-from apex_ompl.util.files import read_text, write_atomically
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.schema import check_version, read_json
 
 __all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key", "unproved", "write_covers"]
 
@@ -163,13 +164,8 @@ def read_covers(path: Path | str) -> dict[str, Cover]:
         FileFormatError: It does not hold covers.
     """
     name = str(path)
-    try:
-        data = json.loads(read_text(Path(path), "sphere covers"))
-    except (ValueError, RecursionError) as error:
-        raise FileFormatError(name, "", str(error), "expected JSON") from error
-    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        found = data.get("schema") if isinstance(data, dict) else data
-        raise FileFormatError(name, "schema", found, f"expected {SCHEMA!r}")
+    data = read_json(Path(path), "sphere covers")
+    check_version(data, SCHEMA, path)
     if data.get("columns") != COLUMNS:
         raise FileFormatError(name, "columns", data.get("columns"), f"expected {COLUMNS}")
     if not isinstance(data.get("covers"), dict):

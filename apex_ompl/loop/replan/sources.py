@@ -12,15 +12,8 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.kernel.search import TreePair
 from apex_ompl.model.query import Query
 from apex_ompl.moving.context import RunContext
-from apex_ompl.moving.search import (
-    STATES,
-    InitialMotion,
-    Search,
-    fresh_checker,
-    place_nearest,
-    rest_of_route,
-    shortest_duration,
-)
+from apex_ompl.moving.motion_optimizer import InitialMotion, shortest_duration
+from apex_ompl.moving.search import STATES, Search, Source, fresh_checker, place_nearest, rest_of_route
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.paths.path import SEARCH_RESOLUTION, resample
@@ -33,13 +26,10 @@ WORK = "state of a tree"
 
 
 @dataclass(frozen=True)
-class Route:
+class Route(Source):
     """The remaining part of the last motion to a goal."""
 
     name: str = "route"
-
-    def prepare(self, context: RunContext) -> None:
-        """Nothing is needed."""
 
     def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the rest of the route, where there is one."""
@@ -49,13 +39,10 @@ class Route:
 
 
 @dataclass(frozen=True)
-class Faster:
+class Faster(Source):
     """The remaining motion, faster."""
 
     name: str = "faster"
-
-    def prepare(self, context: RunContext) -> None:
-        """Nothing is needed."""
 
     def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the rest of the motion, where it has no conflict."""
@@ -69,7 +56,7 @@ class Faster:
 
 
 @dataclass(frozen=True)
-class Lines:
+class Lines(Source):
     """Straight lines to the nearest goals, or random perturbations of them.
 
     Attributes:
@@ -82,9 +69,6 @@ class Lines:
     size: float = PERTURBATION_SIZE
     goals: int = 2
     name: str = "line"
-
-    def prepare(self, context: RunContext) -> None:
-        """Nothing is needed."""
 
     def initial_motions(self, search: Search) -> Iterator[InitialMotion]:
         """Yield the lines."""
