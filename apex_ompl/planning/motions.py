@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.errors import TimingError
 from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
@@ -62,6 +63,24 @@ def knows_obstacles(setup: PlanningSetup) -> bool:
     si = setup.simple_setup.getSpaceInformation()
     checker, validator = si.getStateValidityChecker(), si.getMotionValidator()
     return type(checker) is StateValidityChecker and type(validator) is MotionValidator
+
+
+_warm: set[str] = set()  # robots of which the code is loaded
+
+
+def warm_up(checker: CollisionChecker) -> None:
+    """Load or compile the code that motions by an objective need, so that no plan waits for it."""
+    robot = checker.robot
+    if robot.name in _warm:
+        return
+    ends = np.stack([robot.home, robot.home + np.where(np.arange(robot.dof) == 0, 0.1, 0.0)])
+    kernel, rng = CollisionChecker(robot).kernel, np.random.default_rng(0)
+    spline = DurationOptimizer(kernel, robot.limits).fastest(ends)
+    if spline is not None:
+        calm_motion(spline.trajectory(robot.joint_names), robot.limits)
+    TreePair(kernel, ends[:1], ends[1:], TREE_RANGE, SEARCH_RESOLUTION, rng).grow(1)
+    shortcut(kernel, np.stack([ends[0]] * 3), 1, RESOLUTION, rng)
+    _warm.add(robot.name)
 
 
 def optimized_motion(

@@ -259,7 +259,7 @@ class MotionPlanner:
         from apex_ompl.apex.parameters import NAME
         from apex_ompl.collision.conservative import CheckCounts
         from apex_ompl.ompl.process import Interrupt, quiet_ompl
-        from apex_ompl.planning import steps
+        from apex_ompl.planning import motions, steps
         from apex_ompl.planning.departure import departed, with_departure
         from apex_ompl.planning.query import dynamic_of, snapshot_notes
         from apex_ompl.timing import Timing, warm_up
@@ -293,6 +293,8 @@ class MotionPlanner:
             notes += [note for note in self._checker.mesh_notes if note not in given.notes]
             if timing is not None:
                 warm_up()
+                if options.objective != "length":
+                    motions.warm_up(checker)
             if dynamic:
                 from apex_ompl.planning import among_dynamic_obstacles
 
