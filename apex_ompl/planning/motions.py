@@ -22,6 +22,7 @@ from apex_ompl.paths.path import SEARCH_RESOLUTION, Path
 from apex_ompl.robot.model import Limits
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing import MotionLimits, TimedPath, Timing, Trajectory
+from apex_ompl.timing import warm_up as warm_up_timing
 from apex_ompl.timing.duration import DurationOptimizer
 from apex_ompl.timing.parameterization import fitted
 from apex_ompl.timing.ruckig_method import calm as calm_motion
@@ -69,11 +70,12 @@ _warm: set[str] = set()  # robots of which the code is loaded
 
 
 def warm_up(checker: CollisionChecker) -> None:
-    """Load or compile the code that motions by an objective need, so that no plan waits for it."""
+    """Load or compile the code that motions need, so that no plan waits for it."""
     robot = checker.robot
     if robot.name in _warm:
         return
     ends = np.stack([robot.home, robot.home + np.where(np.arange(robot.dof) == 0, 0.1, 0.0)])
+    warm_up_timing()
     kernel, rng = CollisionChecker(robot).kernel, np.random.default_rng(0)
     spline = DurationOptimizer(kernel, robot.limits).fastest(ends)
     if spline is not None:

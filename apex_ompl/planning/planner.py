@@ -262,7 +262,7 @@ class MotionPlanner:
         from apex_ompl.planning import motions, steps
         from apex_ompl.planning.departure import departed, with_departure
         from apex_ompl.planning.query import dynamic_of, snapshot_notes
-        from apex_ompl.timing import Timing, warm_up
+        from apex_ompl.timing import Timing
 
         options.check()
         robot, leave_contact = self.robot, options.leave_contact
@@ -292,9 +292,7 @@ class MotionPlanner:
             notes += given.notes
             notes += [note for note in self._checker.mesh_notes if note not in given.notes]
             if timing is not None:
-                warm_up()
-                if options.objective != "length":
-                    motions.warm_up(checker)
+                motions.warm_up(checker)
             if dynamic:
                 from apex_ompl.planning import among_dynamic_obstacles
 
