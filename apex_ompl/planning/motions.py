@@ -1,7 +1,7 @@
 """The motion of a plan: duration or calm as the objective, proved along its own curve.
 
 The motion starts from the path that was found. Where it ends at one of several goals, straight motions to others that
-could be reached sooner are tried, too.
+could be reached sooner are tried, too, and other paths where it takes a detour in time.
 """
 
 from __future__ import annotations
@@ -115,14 +115,14 @@ def optimized_motion(
         if found is not None and least >= SOONER * found.spline.duration:
             break
         found = search.sooner(found, np.stack([setup.start, goal]), SOONER)
-    for other in _other_ways(setup, path, found, limits):
+    for other in _other_ways(setup, path, found, limits, stop):
         found = search.sooner(found, other, AS_SOON)
     if found is not None:
         calm = query.objective == "calm"
         found = search.lasting(
             found, max((query.calm_factor if calm else 1.0) * found.spline.duration, timing.minimum_duration), calm
         )
-    timed = None if found is None else _kept(found, limits, timing, check, more)
+    timed = None if found is None else _kept(search, found, limits, timing, more)
     return None if timed is None else _with_path(setup, *timed)
 
 
@@ -179,19 +179,20 @@ class _Search(NamedTuple):
 
 
 def _kept(
-    found: _Proved, limits: Limits, timing: Timing, check: Check, more: MotionLimits | None
+    search: _Search, found: _Proved, limits: Limits, timing: Timing, more: MotionLimits | None
 ) -> tuple[TimedPath, PathProof] | None:
     """Return the motion within limits of torques and tool speeds, and its certificate, or None where none is proved."""
     motion = found.timed.trajectory
     if more is None or more.stretch(motion) == 1.0:
         return found.timed, found.proof
     try:
-        faster = fitted(motion, limits, more, replace(timing, deviation=min(timing.deviation, FITTED)))
+        near = replace(timing, deviation=min(timing.deviation, FITTED))
+        faster = fitted(motion, limits, more, near, stop=search.stop)
     except TimingError:  # gravity overloads it
         return None
     slower = replace(found.timed, trajectory=motion.slower(more.stretch(motion)).merged())
     for candidate in (faster, slower):
-        checked = check(candidate.trajectory)
+        checked = search.check(candidate.trajectory)
         if checked and checked.proof is not None:
             return replace(candidate, deviation=0.0), checked.proof
     return None
@@ -205,7 +206,9 @@ def _other_goals(setup: PlanningSetup, path: Path, limits: Limits) -> list[tuple
     return [(goals[k], float(durations[k])) for k in np.argsort(durations, kind="stable")[:GOALS]]
 
 
-def _other_ways(setup: PlanningSetup, path: Path, found: _Proved | None, limits: Limits) -> Iterator[Array]:
+def _other_ways(
+    setup: PlanningSetup, path: Path, found: _Proved | None, limits: Limits, stop: Callable[[], bool]
+) -> Iterator[Array]:
     """Yield other paths, by new trees and shortcuts, where the motion takes much longer than a direct one to a goal."""
     goals = np.concatenate([path.states[-1:], setup.valid_goals])
     durations = direct_durations(setup.start, goals, limits)
@@ -213,10 +216,12 @@ def _other_ways(setup: PlanningSetup, path: Path, found: _Proved | None, limits:
     goals = goals[durations < most][: GOALS + 1]
     kernel, rng = setup.checker.kernel.within(*setup.bounds), np.random.default_rng([setup.seed, WAYS])
     for one in rng.spawn(WAYS) if len(goals) else ():
+        if stop():
+            return
         trees = TreePair(kernel, setup.start[None], goals, TREE_RANGE, SEARCH_RESOLUTION, one)
-        way = trees.grow(ITERATIONS)
+        way = trees.grow(ITERATIONS, stop)
         if way is not None:
-            yield shortcut(kernel, way, ENOUGH, RESOLUTION, one.spawn(1)[0])[0]
+            yield shortcut(kernel, way, ENOUGH, RESOLUTION, one.spawn(1)[0], stop)[0]
 
 
 def _with_path(setup: PlanningSetup, timed: TimedPath, proof: PathProof) -> ProvedMotion | None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import nan
 from typing import Any
@@ -46,7 +47,7 @@ from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import Problem
-from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing import TimedPath, Timing, Trajectory, time_path
 from apex_ompl.timing.duration import CALM_FACTOR, DEFAULT_OBJECTIVE, check_objective
 from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
@@ -496,6 +497,7 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         found.append(check(motion))
         return found[-1].reason
 
+    made: TimedPath | None = None
     by_objective = query.objective != "length" and timing.start(scaled) is None and knows_obstacles(setup)
     try:
         with timed(query.times, "timing"):
@@ -503,8 +505,9 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
                 raise TimingError(overload)
             better = optimized_motion(query, path, timing, check, more) if by_objective else None
             straight = len(path.states) == 2 and query.objective != "calm"  # Ruckig's profile may be faster
-            along = straight or not better
-            made = time_path(path, limits, names, timing, fault, stop=query.ends, motion_limits=more) if along else None
+            with suppress(*(() if better is None else (TimingError, TimingStoppedError))):
+                if straight or better is None:
+                    made = time_path(path, limits, names, timing, fault, stop=query.ends, motion_limits=more)
     except TimingStoppedError:
         return replace(result, status=PlanStatus.TIMEOUT, reason=NOT_TIMED)
     except TimingError as error:

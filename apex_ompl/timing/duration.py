@@ -41,13 +41,13 @@ MOST_SPANS = 400
 FEW_STATES = 33  # of a path, for its clearance
 DEEP, STUCK = -0.02, 0.8  # clearance of a motion with little hope [m], and least ratio to the one before a round
 SLOWER = 1.15  # ratio of its duration to the one that it is to undercut
-PROX = 1e-3
+PROX = 1e-3  # weight of half the squared change of a sample in a step [1/rad^2]
 LARGEST, CAREFUL = 0.25, 0.06  # change of a control point in a step, and where these go through an obstacle [rad]
 DETOUR, WORTH = 1.03, 0.98  # over the direct duration, beyond which less margin is tried, and what it has to save
 GREW = 1.3  # ratio of a duration to that of the first guess
 LOST = -0.01  # clearance of a motion that is on the wrong side of an obstacle [m]
-DECREASE = 0.3
-STEPS = 30
+DECREASE = 0.3  # share of the mean of slacks times multipliers that a step aims at
+STEPS = 30  # of a round, at most
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,15 @@ import json
 
 import numpy as np
 import pytest
+from ompl import base as ob
 from ompl import geometric as og
 from planning import cached_problem
 
-from apex_ompl import plan
+from apex_ompl import MotionPlanner, plan
 from apex_ompl.cli import main
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.errors import ParameterError, UnknownNameError
+from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError, UnknownNameError
+from apex_ompl.planning import steps
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.timing import Timing
@@ -70,6 +72,42 @@ def test_a_start_that_moves_is_timed_along_the_path() -> None:
     result = plan(cached_problem(NAME), seed=1, timeout=20.0, timing=Timing(start_velocity=velocity.tolist()))
     assert result and result.trajectory is not None
     np.testing.assert_allclose(result.trajectory.velocities[0], velocity)
+
+
+@pytest.mark.parametrize("error", [TimingError, TimingStoppedError])
+def test_an_optimized_motion_stays_where_the_straight_line_cannot_be_timed(
+    error: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*args: object, **options: object) -> None:
+        raise error("on purpose")
+
+    planner = MotionPlanner()
+    home, goal = planner.robot.home, planner.robot.home.copy()
+    goal[[0, 7]] += 0.4, -0.3
+    assert planner.plan(home, goal, timeout=20.0).solved_by == "straight line"
+    monkeypatch.setattr(steps, "time_path", fails)
+    result = planner.plan(home, goal, timeout=20.0)
+    assert result and result.trajectory is not None and result.deviation == 0.0
+    assert not planner.plan(home, goal, timeout=20.0, objective="length")
+
+
+def test_a_checker_of_the_users_decides_what_its_motion_is_along() -> None:
+    """What it forbids this project's optimizer does not know: the motion follows the path."""
+    asked = 0
+
+    def planner(si: ob.SpaceInformation) -> og.RRTConnect:
+        def valid(state: ob.State) -> bool:
+            nonlocal asked
+            asked += 1
+            return checker.are_free(np.array([[state[k] for k in range(16)]]))[0] and state[15] < 0.9
+
+        checker = si.getStateValidityChecker().checker
+        si.setStateValidityChecker(valid)
+        return og.RRTConnect(si)
+
+    result = plan(cached_problem(NAME), planner, seed=1, timeout=30.0)
+    assert result and asked and result.trajectory is not None and result.trajectory.positions[:, 15].max() < 0.9
+    assert result.deviation > 0.0 and "optimized" not in result.timing_method
 
 
 def test_faulty_objectives(capsys: pytest.CaptureFixture[str]) -> None:
