@@ -18,7 +18,7 @@ from apex_ompl.kernel.compiled.path.path_cost import CostSettings, PathReport
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.path import PathGrid
-from apex_ompl.kernel.search import TreePair
+from apex_ompl.kernel.search import SearchBuffers, SearchCounts, TreePair
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
@@ -32,11 +32,13 @@ __all__ = [
     "ConstraintGroup",
     "ConstraintRows",
     "JointFrame",
+    "ManifoldConnection",
     "optimize_constrained_path",
 ]
 
 MOST_ROWS = {POSITION: 3, AXIS: 2, ROTATION: 3}
 LONGEST, PIECES = 0.15, 2  # of an edge of trees [rad], and its chords
+MOST_EDGES = 200  # of a connection
 AT_ONCE = 8  # random states between two looks at the clock
 ORTHOGONAL = 1e-6
 
@@ -289,3 +291,34 @@ class ConstrainedTreePair(TreePair):
 
     def _advance(self, samples: Array) -> int:
         return int(search.grow_constrained_trees(*self._arguments(samples), *self._constrained))
+
+
+class ManifoldConnection:
+    """Connections of states on the manifold of constraints, in edges as trees have them."""
+
+    def __init__(
+        self, kernel: Kernel, rows: ConstraintRows, resolution: float, longest: float = LONGEST, pieces: int = PIECES
+    ) -> None:  # fmt: skip
+        """Connect states; arguments as of :class:`ConstrainedTreePair`."""
+        self._kernel, self._resolution, self._longest = kernel, resolution, longest
+        self._buffers = SearchBuffers(kernel, 2.0 * longest, resolution)
+        self._constrained = *rows.packed, int(pieces), rows.rows, *rows.buffers(), np.empty((2, kernel.robot.dof))
+
+    def between(self, first: Array, last: Array, most: int = MOST_EDGES) -> Array | None:
+        """Return states from one to another, shape (N, dof), or None where the way by projected steps does not arrive.
+
+        Args:
+            first: The first state, shape (dof,).
+            last: The last state, shape (dof,).
+            most: Largest number of edges.
+        """
+        nodes, target = np.empty((most, len(first))), np.array(last)
+        count = search.connect_states(
+            *self._kernel.packed, *self._buffers.workspace, compact(first), self._longest, self._resolution, target,
+            nodes, *self._buffers.proof, *self._constrained,
+        )  # fmt: skip
+        return None if count < 0 else np.concatenate([first[None], nodes[:count]])
+
+    def take_counts(self) -> SearchCounts:
+        """Return the counts since the last call."""
+        return self._buffers.take_counts()
