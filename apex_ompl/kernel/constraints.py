@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled.arrays import FIXED
-from apex_ompl.kernel.compiled.constraint import path_optimization, projection, search
+from apex_ompl.kernel.compiled.constraint import path_optimization, projection, proof, search
 from apex_ompl.kernel.compiled.constraint.rows import AXIS, POSITION, ROTATION, ConstraintArrays, RowBuffers
 from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.path.path_cost import CostSettings, PathReport
@@ -30,10 +31,13 @@ __all__ = [
     "ROTATION",
     "ConstrainedTreePair",
     "ConstraintGroup",
+    "ConstraintProof",
     "ConstraintRows",
     "JointFrame",
     "ManifoldConnection",
     "optimize_constrained_path",
+    "prove_motion",
+    "prove_path",
 ]
 
 MOST_ROWS = {POSITION: 3, AXIS: 2, ROTATION: 3}
@@ -322,3 +326,84 @@ class ManifoldConnection:
     def take_counts(self) -> SearchCounts:
         """Return the counts since the last call."""
         return self._buffers.take_counts()
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintProof:
+    """Whether G groups hold along a whole curve, see :mod:`apex_ompl.kernel.compiled.constraint.proof`.
+
+    Attributes:
+        proved: Whether |r| <= tolerance holds for all of them.
+        bounds: Proved upper bounds on their largest |r|, shape (G,) [m, rad]; infinite where it is not proved.
+        violations: Their largest |r| at the states that were examined, shape (G,).
+        intervals: Number of intervals that were examined.
+        piece: Piece between states ``piece`` and ``piece + 1`` at which the proof failed, or -1.
+        share: Place on that piece, from 0 to 1.
+        group: Group that failed there; -1 where it did not, or where the piece has no numbers.
+        value: Its |r| there where that is above the tolerance; else the bound that stays above it.
+    """
+
+    proved: bool
+    bounds: Array
+    violations: Array
+    intervals: int
+    piece: int = -1
+    share: float = math.nan
+    group: int = -1
+    value: float = math.nan
+
+
+def prove_path(rows: ConstraintRows, states: ArrayLike) -> ConstraintProof:
+    """Prove that constraints hold along straight lines between states; what has no finite numbers is not proved.
+
+    Args:
+        rows: The constraints.
+        states: One or more states, shape (N, dof).
+
+    Raises:
+        ParameterError: Another shape.
+    """
+    q = compact(states)
+    if q.ndim != 2 or q.shape[1] != rows.robot.dof or len(q) == 0:
+        raise shape_error(q, ("N", rows.robot.dof), "states")
+    none = np.empty((0, rows.robot.dof))
+    return _proof(rows, np.empty(0), q, none, none)
+
+
+def prove_motion(
+    rows: ConstraintRows, times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, accelerations: ArrayLike
+) -> ConstraintProof:
+    """Prove that constraints hold along a motion of constant jerk between knots.
+
+    Gaps between the end of a piece and the knot there are counted in. What has no finite numbers, or times that
+    decrease, is not proved.
+
+    Args:
+        rows: The constraints.
+        times: Times of the knots, one or more, shape (K,) [s].
+        positions: At them, shape (K, dof).
+        velocities: At them.
+        accelerations: At them.
+
+    Raises:
+        ParameterError: Another shape.
+    """
+    knots, states = compact(times), tuple(compact(one) for one in (positions, velocities, accelerations))
+    if knots.ndim != 1 or len(knots) == 0:
+        raise shape_error(knots, ("K",), "times")
+    for one, name in zip(states, ("positions", "velocities", "accelerations"), strict=True):
+        if one.shape != (len(knots), rows.robot.dof):
+            raise shape_error(one, (len(knots), rows.robot.dof), name)
+    return _proof(rows, knots, *states)
+
+
+def _proof(rows: ConstraintRows, *curve: Array) -> ConstraintProof:
+    integers, floats, b = new_buffers(proof.ConstraintProofBuffers, groups=len(rows.groups), dof=rows.robot.dof)
+    outcome = proof.prove_constraints(*rows._head(), *curve, *rows.buffers(), rows.rows, integers, floats)
+    (intervals, piece, group), violations = b.counts.tolist(), b.violations.copy()
+    if outcome == proof.PROVED:
+        return ConstraintProof(True, b.bounds.copy(), violations, intervals)
+    return ConstraintProof(
+        False, np.full(len(rows.groups), np.inf), violations, intervals, piece, float(b.figures[0]), group,
+        float(b.figures[1]),
+    )  # fmt: skip
