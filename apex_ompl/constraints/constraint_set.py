@@ -267,7 +267,7 @@ class ConstraintSet:
         lower, upper = self.robot.limits.lower, self.robot.limits.upper
         q, free = np.clip(q, lower, upper), np.ones(len(q), bool)
         for step in range(NEWTON_STEPS + 1):
-            r, jacobian = self._residual(q)
+            r, jacobian = self.residual(q)
             if length(r) <= NEWTON_END:
                 return q, True
             if step == NEWTON_STEPS or not np.isfinite(r).all() or not np.isfinite(jacobian).all():
@@ -281,7 +281,7 @@ class ConstraintSet:
             free = q == moved
         return q, self.is_satisfied(q)
 
-    def _residual(self, q: Array) -> tuple[Array, Array]:
+    def residual(self, q: Array) -> tuple[Array, Array]:
         """Return the rows outside of dead zones, shape (m,), and their Jacobian, shape (m, dof)."""
         rows = [] if self.rows is None else [self.rows.residual(q, 1.0)]
         for one in self.user:

@@ -318,7 +318,9 @@ class _Reader(MessageReader):
         try:
             return validate(kind, fields, str(self.file))
         except FileFormatError as error:
-            raise self.fail(inside(where, error.field) if error.field else where, error.value, error.expected) from error
+            raise self.fail(
+                inside(where, error.field) if error.field else where, error.value, error.expected
+            ) from error
 
     def operation(self, item: Mapping[str, Any], known: tuple[int, ...], where: str) -> int:
         """Return what is done with an object, out of the known operations."""
