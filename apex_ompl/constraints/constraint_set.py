@@ -8,7 +8,7 @@ in Python.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +45,10 @@ NEWTON_STEPS, NEWTON_END = 20, 1e-9  # most steps, and the |r| to stop at, with 
 DAMPING = 1e-10  # of the normal equations of these steps
 ATTEMPTS = 100  # random states from which contradictions are looked for
 AXES = ("x", "y", "z")
+
+
+Residual = Callable[[Array], tuple[Array, Array]]
+"""Returns rows at a state, shape (m,), and their Jacobian, shape (m, dof)."""
 
 
 class Part(NamedTuple):
@@ -207,7 +211,7 @@ class ConstraintSet:
         """
         q = self._states(states)
         if self.user:
-            found = [self._newton(row) for row in q]
+            found = [self.newton(row) for row in q]
             ends = np.array([end for end, _ in found]).reshape(q.shape)
             arrived = np.array([there for _, there in found], bool)
         elif self.rows is not None:
@@ -259,15 +263,19 @@ class ConstraintSet:
     def _states(self, states: ArrayLike) -> Array:
         return np.array(states, float, ndmin=2)
 
-    def _newton(self, q: Array) -> tuple[Array, bool]:
+    def newton(self, q: Array, also: Residual | None = None) -> tuple[Array, bool]:
         """Return the end of Newton's method with the pseudoinverse from a state, and whether it arrived.
 
         A joint that a step takes beyond a limit stays out of the next step.
+
+        Args:
+            q: The state, shape (dof,).
+            also: Further rows, such as those of a goal, and their Jacobian.
         """
         lower, upper = self.robot.limits.lower, self.robot.limits.upper
         q, free = np.clip(q, lower, upper), np.ones(len(q), bool)
         for step in range(NEWTON_STEPS + 1):
-            r, jacobian = self.residual(q)
+            r, jacobian = self.residual(q, also)
             if length(r) <= NEWTON_END:
                 return q, True
             if step == NEWTON_STEPS or not np.isfinite(r).all() or not np.isfinite(jacobian).all():
@@ -281,13 +289,14 @@ class ConstraintSet:
             free = q == moved
         return q, self.is_satisfied(q)
 
-    def residual(self, q: Array) -> tuple[Array, Array]:
-        """Return the rows outside of dead zones, shape (m,), and their Jacobian, shape (m, dof)."""
+    def residual(self, q: Array, also: Residual | None = None) -> tuple[Array, Array]:
+        """Return the rows outside of dead zones, shape (m,), and their Jacobian, shape (m, dof); see :meth:`newton`."""
         rows = [] if self.rows is None else [self.rows.residual(q, 1.0)]
         for one in self.user:
-            r, jacobian = np.array(one.residual(q.copy()), float), np.array(one.jacobian(q.copy()), float)
+            rows.append((np.array(one.residual(q.copy()), float), np.array(one.jacobian(q.copy()), float)))
+        rows += [] if also is None else [also(q)]
+        for _, jacobian in rows:
             jacobian[:, list(self.fixed)] = 0.0
-            rows.append((r, jacobian))
         return np.concatenate([r for r, _ in rows]), np.vstack([jacobian for _, jacobian in rows])
 
 

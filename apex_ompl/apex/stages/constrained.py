@@ -172,17 +172,20 @@ class ConstrainedShorten:
             yield paths.fit(context.best.states)
         pair = context.best.states[[0, -1]]
         yield context.optimizer.spline.line(*pair)
-        for turn in count() if self.again else range(1):
-            if not self.again and context.best.length <= DETOUR * path_length(pair):
-                return
-            proposed = context.sampler.propose(context.queries, max(self.count, 1)) if self.count else None
-            yield from () if proposed is None else proposed
-            if self.again:
-                trees = ConstrainedTrees(ITERATIONS).run(context)
-                nodes, context.tree_nodes = context.tree_nodes, None
-                if trees is not None and nodes is not None:
-                    yield paths.fit(self._shortcut(context, paths, nodes))
-            del turn
+        if context.best.length > DETOUR * path_length(pair):
+            yield from self._proposals(context)
+        while self.again:
+            trees = ConstrainedTrees(ITERATIONS).run(context)
+            nodes, context.tree_nodes = context.tree_nodes, None
+            if trees is not None and nodes is not None:
+                yield paths.fit(self._shortcut(context, paths, nodes))
+            yield from self._proposals(context)
+
+    def _proposals(self, context: SolveContext) -> Array:
+        """Return control points of proposals, shape (B, points, dof)."""
+        proposed = context.sampler.propose(context.queries, self.count) if self.count else None
+        spline, dof = context.optimizer.spline, context.kernel.robot.dof
+        return np.empty((0, spline.points, dof)) if proposed is None else proposed
 
     @staticmethod
     def _shortcut(context: SolveContext, paths: ConstrainedPaths, nodes: Array) -> Array:
