@@ -57,7 +57,15 @@ class ConstrainedTrees:
     iterations: int
 
     def run(self, context: SolveContext) -> Solution | None:
-        """Return the path of the trees, cut short, or None where they do not meet, or it is not valid."""
+        """Return the path of the trees, or None where they do not meet, or it is not valid."""
+        found = self.search(context)
+        if found is None:
+            return None
+        context.tree_nodes, states = found
+        return Solution(Path(states), TREES)
+
+    def search(self, context: SolveContext) -> tuple[Array, Array] | None:
+        """Return nodes and states of a valid path, or None where there is none."""
         paths = on_constraints(context)
         with context.report.timed("rrtconnect"):
             trees = context.constrained_trees or paths.trees(
@@ -72,10 +80,7 @@ class ConstrainedTrees:
         context.constrained_trees = None  # they have met: others are to find another path
         with context.report.timed("check"):
             states = paths.along(nodes)
-        if states is None:
-            return None
-        context.tree_nodes = nodes
-        return Solution(Path(states), TREES)
+        return None if states is None else (nodes, states)
 
 
 @dataclass(frozen=True)
@@ -175,10 +180,9 @@ class ConstrainedShorten:
         if context.best.length > DETOUR * path_length(pair):
             yield from self._proposals(context)
         while self.again:
-            trees = ConstrainedTrees(ITERATIONS).run(context)
-            nodes, context.tree_nodes = context.tree_nodes, None
-            if trees is not None and nodes is not None:
-                yield paths.fit(self._shortcut(context, paths, nodes))
+            found = ConstrainedTrees(ITERATIONS).search(context)
+            if found is not None:
+                yield paths.fit(self._shortcut(context, paths, found[0]))
             yield from self._proposals(context)
 
     def _proposals(self, context: SolveContext) -> Array:
