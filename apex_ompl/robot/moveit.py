@@ -318,7 +318,9 @@ class _Reader(MessageReader):
         try:
             return validate(kind, fields, str(self.file))
         except FileFormatError as error:
-            raise self.fail(inside(where, error.field) if error.field else where, error.value, error.expected) from error
+            raise self.fail(
+                inside(where, error.field) if error.field else where, error.value, error.expected
+            ) from error
 
     def operation(self, item: Mapping[str, Any], known: tuple[int, ...], where: str) -> int:
         """Return what is done with an object, out of the known operations."""
@@ -490,8 +492,9 @@ def _orientation_constraint(
 ) -> Iterator[Constraint]:
     """Yield a constraint of the orientation, or of one axis where turns about it are free.
 
-    MoveIt bounds the angles about x, y and z of the rotation from the wanted orientation, as Euler angles or as parts of
-    the rotation vector. Up to a right angle none of them is larger than the angle of the rotation, which is bounded here.
+    MoveIt bounds the angles about x, y and z of the rotation from the wanted orientation, as Euler angles or as parts
+    of the rotation vector. Up to a right angle none of them is larger than the angle of the rotation, which is bounded
+    here.
     """
     link, base = reader.constrained_link(message, start, where)
     base = base @ reader.pose({"orientation": message.get("orientation")}, where)
