@@ -62,7 +62,7 @@ class ConstraintProofBuffers(NamedTuple):
 
     Attributes:
         counts: Intervals examined, and piece and group at which the proof failed, -1 for none.
-        figures: Share of the piece, and |r| or the bound at which it failed.
+        figures: Share of the piece at which it failed, and |r| there.
         bounds: Largest proved bounds of the groups [m, rad].
         violations: Largest |r| of the groups at examined states [m, rad].
         found: Bounds of the groups on an interval.
@@ -297,7 +297,7 @@ def _set_interval(middle: float, half: float, p: ConstraintProofBuffers) -> None
 def _examine(
     t: RobotArrays, w: Workspace, c: ConstraintArrays, p: ConstraintProofBuffers, b: RowBuffers
 ) -> tuple[int, int, float]:
-    """Examine the interval that is set: outcome, group and figure; UNDECIDED where it is to be bisected."""
+    """Return outcome, failing group and its |r| for the interval that is set; UNDECIDED where it is to be bisected."""
     place_joints(t, w, p.state, c.chain, 0, len(c.chain))
     for g in range(len(c.kind)):
         size, bound = bound_group(t, w, c, g, p, b)
@@ -305,7 +305,7 @@ def _examine(
         if not size <= c.tolerance[g]:
             return VIOLATED, g, size
         if not bound <= c.tolerance[g]:
-            return UNDECIDED, g, bound
+            return UNDECIDED, g, size
         p.found[g] = bound
     for g in range(len(c.kind)):
         p.bounds[g] = max(p.bounds[g], p.found[g])
@@ -363,12 +363,12 @@ def prove_constraints(
             middle = 0.5 * (start + end)
             _set_interval(middle, 0.5 * (end - start), p)
             p.counts[0] += 1
-            outcome, g, figure = _examine(t, w, c, p, b)
+            outcome, g, size = _examine(t, w, c, p, b)
             if outcome == PROVED:
                 continue
             last = top + 2 > len(p.stack) or p.counts[0] >= most
             if outcome == VIOLATED or last or not p.violations[g] + ROUNDING <= c.tolerance[g]:
-                p.counts[1], p.counts[2], p.figures[0], p.figures[1] = k, g, middle, figure
+                p.counts[1], p.counts[2], p.figures[0], p.figures[1] = k, g, middle, size
                 return outcome
             p.stack[top, 0], p.stack[top, 1] = middle, end
             p.stack[top + 1, 0], p.stack[top + 1, 1] = start, middle
