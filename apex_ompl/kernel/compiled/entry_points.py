@@ -241,6 +241,16 @@ CONSTRAINED = Group(
             ),
         },
         {
+            "constraint.duration.lower_constrained_duration": (
+                ROBOT
+                + SCENE
+                + WORKSPACE
+                + "f8[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], i8, f8, f8[:, ::1], "
+                + "Tuple((f8, f8, f8, f8, f8, f8, f8, f8, f8, i8)), i8[::1], f8[::1], "
+                + ROBOT
+                + "f8, f8, i8, i8[::1], f8[::1]",
+                12,
+            ),
             "constraint.path_optimization.optimize_constrained_path": (
                 ROBOT
                 + SCENE
