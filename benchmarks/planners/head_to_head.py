@@ -48,8 +48,7 @@ from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 
 DEPENDS = (
-    "@benchmark", "apex_ompl/baselines", "apex_ompl/timing", "benchmarks/baselines", "benchmarks/lib/controls.py",
-    "benchmarks/lib/control_planners.py",
+    "@benchmark", "apex_ompl/baselines", "apex_ompl/timing", "benchmarks/baselines",
 )  # fmt: skip
 FOLDER = Path(__file__).parents[1] / "runs" / "head_to_head"
 TIMEOUT = 10.0  # [s]
@@ -200,7 +199,7 @@ def main() -> None:
         "--slow", type=one_or_more, default=SLOW, help="of them for rows that take long (default: %(default)s)"
     )
     args = parser.parse_args()
-    workers = Workers(args.jobs, modules=("control_planners",))
+    workers = Workers(args.jobs)
     rows = [row if row.runs is None else replace(row, runs=args.slow) for row in ROWS]
     levels, seeds = record.static_levels(args.levels), {row.label: min(args.n, row.runs or args.n) for row in rows}
     results = bench(
