@@ -25,7 +25,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl import planners
-from apex_ompl.apex.parameters import NAME
+from apex_ompl.apex.parameters import NAME, ApexParameters
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.errors import ApexError, TimingError, TimingStoppedError
@@ -76,6 +76,7 @@ class PlanQuery:
         deadline: When the plan is to be ready.
         objective: What the motion is to be, one of :data:`apex_ompl.timing.duration.OBJECTIVES`.
         calm_factor: Duration of a calm motion as a multiple of the fastest one's.
+        improves_motion: Whether faster motions are sought until the time is up.
         status: INVALID_START or INVALID_GOAL, or None.
         reason: Why it is one of these, in one sentence.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started [s].
@@ -93,6 +94,7 @@ class PlanQuery:
     deadline: Deadline
     objective: str = DEFAULT_OBJECTIVE
     calm_factor: float = CALM_FACTOR
+    improves_motion: bool = False
     status: PlanStatus | None = None
     reason: str = ""
     started: float = 0.0
@@ -204,7 +206,7 @@ def assemble(
 
 def check(
     setup: PlanningSetup, planner: AnyPlanner = NAME, *, params: Mapping[str, Any] | None = None, timeout: float = 5.0,
-    objective: str = DEFAULT_OBJECTIVE, calm_factor: float = CALM_FACTOR,
+    objective: str = DEFAULT_OBJECTIVE, calm_factor: float = CALM_FACTOR, timing: bool = False,
     started: float | None = None, times: Mapping[str, float] | None = None, notes: Sequence[str] = (),
 ) -> PlanQuery:  # fmt: skip
     """Check the start, the goals and the planner's parameters, and start the time of the plan.
@@ -216,6 +218,8 @@ def check(
         timeout: Seconds for the steps that follow.
         objective: What the motion is to be, see :func:`apex_ompl.plan`.
         calm_factor: Duration of a calm motion as a multiple of the fastest one's.
+        timing: Whether a motion is made: with the parameter ``anytime`` of apex and another objective than ``length``
+            it is then improved in place of the path, in the step :func:`time`.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started, by default now [s].
         times: Seconds by stage so far.
         notes: What a user should know about this plan.
@@ -227,12 +231,16 @@ def check(
     check_objective(objective, calm_factor)
     started = clock.perf_counter() if started is None else started
     parameters = planners.chosen(planner, params, seed=setup.seed)
+    improves_motion = timing and objective != "length" and knows_obstacles(setup)
+    improves_motion &= isinstance(parameters, ApexParameters) and parameters.anytime
+    if improves_motion:
+        parameters = parameters.changed(anytime=False)
     status, reason = query_fault(setup)
     name, spent = parameters.name or UNNAMED, dict(times or {})
-    deadline = Deadline(timeout)
     return PlanQuery(
-        setup, name, parameters, deadline, objective, calm_factor, status, reason, started, spent, list(notes)
-    )
+        setup, name, parameters, Deadline(timeout), objective, calm_factor, improves_motion, status, reason, started,
+        spent, list(notes),
+    )  # fmt: skip
 
 
 def query_fault(setup: PlanningSetup) -> tuple[PlanStatus | None, str]:
@@ -491,7 +499,7 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
             over = [f"{name} {share:.4f}" for name, share in motion.use(scaled).items() if share > 1.0 + ROUNDING]
             if over:
                 return FullCheck(False, f"the share of a limit that it uses is over 1: {', '.join(over)}", None)
-            return full_check(setup.checker, motion, setup.start, setup.goals, deadline=query.deadline.at)
+            return full_check(setup.checker, motion, setup.start, query.setup.goals, deadline=query.deadline.at)
 
     def fault(motion: Trajectory) -> str:
         found.append(check(motion))
