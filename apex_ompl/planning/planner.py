@@ -284,6 +284,7 @@ class MotionPlanner:
             parameters = planners.chosen(
                 NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
             )
+            derivatives = None
             if timing is not None:
                 derivatives = timing.start(timing.limits(robot.limits, robot.joint_names))  # checked before planning
                 timing.motion_limits(robot, problem.attached, problem.payload)  # checked before planning
@@ -306,7 +307,8 @@ class MotionPlanner:
             times = {"setup": time.perf_counter() - started}
             query = steps.check(
                 setup, parameters, timeout=options.timeout, objective=options.objective,
-                calm_factor=options.calm_factor, started=started, times=times, notes=notes,
+                calm_factor=options.calm_factor, timing=timing is not None and not dynamic and derivatives is None,
+                started=started, times=times, notes=notes,
             )  # fmt: skip
             preparing.close()
             with Interrupt() as query.interrupt, running(query.interrupt.end):

@@ -25,11 +25,11 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl import planners
-from apex_ompl.apex.parameters import NAME
+from apex_ompl.apex.parameters import NAME, ApexParameters
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.proof import ConstraintCertificate
+from apex_ompl.constraints.proof import ConstraintCertificate, prove_motion
 from apex_ompl.constraints.user import UserConstraint
 from apex_ompl.errors import ApexError, TimingError, TimingStoppedError
 from apex_ompl.ompl import setup as ompl_setup
@@ -81,6 +81,7 @@ class PlanQuery:
         deadline: When the plan is to be ready.
         objective: What the motion is to be, one of :data:`apex_ompl.timing.duration.OBJECTIVES`.
         calm_factor: Duration of a calm motion as a multiple of the fastest one's.
+        improves_motion: Whether faster motions are sought until the time is up.
         status: INVALID_START or INVALID_GOAL, or None.
         reason: Why it is one of these, in one sentence.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started [s].
@@ -99,6 +100,7 @@ class PlanQuery:
     deadline: Deadline
     objective: str = DEFAULT_OBJECTIVE
     calm_factor: float = CALM_FACTOR
+    improves_motion: bool = False
     status: PlanStatus | None = None
     reason: str = ""
     started: float = 0.0
@@ -225,7 +227,7 @@ def assemble(
 
 def check(
     setup: PlanningSetup, planner: AnyPlanner = NAME, *, params: Mapping[str, Any] | None = None, timeout: float = 5.0,
-    objective: str = DEFAULT_OBJECTIVE, calm_factor: float = CALM_FACTOR,
+    objective: str = DEFAULT_OBJECTIVE, calm_factor: float = CALM_FACTOR, timing: bool = False,
     started: float | None = None, times: Mapping[str, float] | None = None, notes: Sequence[str] = (),
 ) -> PlanQuery:  # fmt: skip
     """Check the start, the goals and the planner's parameters, and start the time of the plan.
@@ -237,6 +239,8 @@ def check(
         timeout: Seconds for the steps that follow.
         objective: What the motion is to be, see :func:`apex_ompl.plan`.
         calm_factor: Duration of a calm motion as a multiple of the fastest one's.
+        timing: Whether a motion is made: with the parameter ``anytime`` of apex and another objective than ``length``
+            it is then improved in place of the path, in the step :func:`time`.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started, by default now [s].
         times: Seconds by stage so far.
         notes: What a user should know about this plan.
@@ -248,12 +252,15 @@ def check(
     check_objective(objective, calm_factor)
     started = clock.perf_counter() if started is None else started
     parameters = planners.chosen(planner, params, seed=setup.seed)
+    improves_motion = timing and objective != "length" and knows_obstacles(setup) and setup.constraints is None
+    improves_motion &= isinstance(parameters, ApexParameters) and parameters.anytime
+    if improves_motion:
+        parameters = parameters.changed(anytime=False)
     status, reason, nearest = query_fault(setup)
     name, spent = parameters.name or UNNAMED, dict(times or {})
-    deadline = Deadline(timeout)
     return PlanQuery(
-        setup, name, parameters, deadline, objective, calm_factor, status, reason, started, spent, list(notes),
-        nearest_state=nearest,
+        setup, name, parameters, Deadline(timeout), objective, calm_factor, improves_motion, status, reason, started,
+        spent, list(notes), nearest_state=nearest,
     )  # fmt: skip
 
 
@@ -556,7 +563,8 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
     made: TimedPath | None = None
     by_objective = query.objective != "length" and timing.start(scaled) is None and knows_obstacles(setup)
     if setup.constraints is not None:
-        by_objective, timing = False, replace(timing, deviation=min(timing.deviation, CONSTRAINED_DEVIATION))
+        by_objective &= not setup.constraints.user
+        timing = replace(timing, deviation=min(timing.deviation, CONSTRAINED_DEVIATION))
     try:
         with timed(query.times, "timing"):
             if more is not None and (overload := more.gravity_fault(path.states)):
@@ -578,8 +586,8 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         made, motion_proof = better.timed, better.motion_proof
         result = replace(result, path=better.path, **certificate(better.path_proof))
     assert made is not None
-    kept = found[-1].constraints if found else None
-    if kept is not None and setup.constraints is not None:
+    if setup.constraints is not None:
+        kept = prove_motion(setup.constraints, made.trajectory)
         result = replace(result, **_constraint_fields(setup.constraints, kept))
     use = made.trajectory.use(limits) | ({} if more is None else more.use(made.trajectory))
     return replace(
