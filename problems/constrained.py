@@ -1,0 +1,169 @@
+"""Levels with constraints: ``tray``, ``level`` and ``cups`` of some suites.
+
+On ``tray`` both hands hold one tray, so that their relative pose stays as at the start. On ``level`` a cup stands on the
+tray, which also stays level. On ``cups`` each hand keeps a cup upright. Cups go through the scenes of the suites
+themselves, trays through those of :mod:`apex_ompl.problems.constrained_scenes`. On ``unseen`` the grammars of that suite
+take turns by the seed; their composition stands somewhere, or where the hands pass, without the parts that are too near
+to the start or to the goal.
+
+Starts and goals are on the constraint, and free by a margin; of the goal's states on many branches of inverse kinematics
+the nearest one to the start is taken. Of ``clutter`` and ``unseen`` most problems are drawn anew where the straight
+line, moved to the constraint, is free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from apex_ompl.goals.state_sampling import HandRegion, scene_kernel
+from apex_ompl.kernel import SceneTables
+from apex_ompl.problems import constrained_scenes, scenes
+from apex_ompl.problems.broad import MOST_OBSTACLES, ROUNDING, UNSEEN, composition, in_the_way, near
+from apex_ompl.problems.broad_representation import draw_representation, feasible, obstacles
+from apex_ompl.problems.broad_tasks import SHOULDERS, clear_parts, palm_line, scene_of
+from apex_ompl.problems.broad_unseen import STRANGERS
+from apex_ompl.problems.constrained_ends import PalmSampler, line_is_free, palms_at, palms_with_cups
+from apex_ompl.problems.constrained_held import CUPS, KINDS, Carried, draw_carried
+from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, robot
+from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.types import Array
+
+SUITES = (*constrained_scenes.SCENES, UNSEEN)
+LEVELS = dict.fromkeys(SUITES, KINDS)
+"""Suite -> its levels with constraints."""
+
+DIFFICULTIES = ("easy", "medium", "hard")  # of the scenes that cups go through
+LEAST_MOTION = 0.5  # of some joint from start to goal [rad]
+EASY = 0.15  # share of scenes that are taken though the straight line is free
+TRIES = 6  # scenes of one draw, until the line is not free
+MET = 0.6  # share of compositions that are put in the way
+YAW = 0.6  # largest yaw of the fingers of a hand that is not sent along a direction [rad]
+JITTER = 0.15  # largest yaw of the fingers of one that is [rad]
+
+
+def draw(rng: np.random.Generator, suite: str, kind: str, seed: int) -> DrawnProblem | None:
+    """Draw a problem of a suite; None when this draw has no start or no goal.
+
+    Args:
+        rng: Source of everything but the grammar.
+        suite: One of ``SUITES``.
+        kind: One of ``KINDS``, the level.
+        seed: Of the problem, by which grammars take turns.
+    """
+    carried = draw_carried(rng, kind)
+    if suite == UNSEEN:
+        return _among_parts(rng, carried, kind, tuple(STRANGERS)[seed % len(STRANGERS)])
+    if kind == CUPS:
+        task = scenes.SUITES[suite](rng, DIFFICULTIES[int(rng.integers(len(DIFFICULTIES)))])
+        scene, ends = task.scene, _cup_ends(rng, carried, _tables(task.scene, carried), task.start, task.goal)
+    elif suite == "clutter":
+        return _tray_in_clutter(rng, carried, kind)
+    else:
+        assert carried.tray is not None
+        tray = constrained_scenes.SCENES[suite](rng, kind, carried.tray)
+        scene, ends = tray.scene, _tray_ends(rng, carried, _tables(tray.scene, carried), tray.start, tray.goal)
+    return None if ends is None else DrawnProblem(scene, ends[0], ends[1], carried.held.attached)
+
+
+def _tables(scene: Sequence[Obstacle], carried: Carried) -> SceneTables:
+    return scene_kernel(robot(), carried.held.tables.both, scene).scene
+
+
+def _tray_in_clutter(rng: np.random.Generator, carried: Carried, kind: str) -> DrawnProblem | None:
+    assert carried.tray is not None
+    easy = rng.random() < EASY
+    for _ in range(TRIES):
+        task = constrained_scenes.clutter(rng, kind, carried.tray)
+        ends = _tray_ends(rng, carried, scene_of(()), task.start, task.goal)
+        if ends is None:
+            continue
+        scene = tuple(body for body in task.scene if _keeps_clear(carried, body, ends))
+        if easy or not line_is_free(carried, kind, _tables(scene, carried), ends):
+            return DrawnProblem(scene, ends[0], ends[1], carried.held.attached)
+    return None
+
+
+def _keeps_clear(carried: Carried, body: Obstacle, ends: Array) -> bool:
+    kernel = scene_kernel(robot(), carried.held.tables.both, [body])
+    return bool((kernel.clearance(ends, MARGIN)[:, 0] >= MARGIN).all())
+
+
+def _among_parts(rng: np.random.Generator, carried: Carried, kind: str, grammar: str) -> DrawnProblem | None:
+    """Draw a problem among the parts of a grammar of ``unseen``."""
+    representation, easy = draw_representation(rng), rng.random() < EASY
+    margin = MARGIN + ROUNDING + representation.swelling
+    for _ in range(TRIES):
+        ends = _ends_anywhere(rng, carried, kind, scene_of(()))
+        if ends is None:
+            continue
+        found = composition(rng, UNSEEN, STRANGERS[grammar])
+        if rng.random() < MET:
+            found = in_the_way(rng, found, palm_line(carried.held.tables.both, ends, 9).reshape(-1, 3))
+        parts = clear_parts(carried.held.tables.both, near(found.parts)[:MOST_OBSTACLES], ends, margin)
+        if easy or not line_is_free(carried, kind, scene_of(parts, representation.swelling), ends):
+            groups = representation.groups(len(parts))
+            groups = groups if feasible(parts, groups) else ()
+            return DrawnProblem(obstacles(parts), ends[0], ends[1], carried.held.attached, groups)
+    return None
+
+
+def _ends_anywhere(rng: np.random.Generator, carried: Carried, kind: str, scene: SceneTables) -> Array | None:
+    if kind == CUPS:
+        regions = [(_wide_region(0), _wide_region(1)) for _ in range(2)]
+        return _cup_ends(rng, carried, scene, *regions)
+    poses = [constrained_scenes.anywhere(rng, kind) for _ in range(2)]
+    return _tray_ends(rng, carried, scene, *poses)
+
+
+def _wide_region(side: int) -> HandRegion:
+    """Return the region of a hand over its own table and a part of the other one."""
+    middle = 0.6 * SHOULDERS[side]
+    return HandRegion((0.3, 0.7), (middle - 0.35, middle + 0.35), (0.12, 0.65), (scenes.DOWN,))
+
+
+def _tray_ends(
+    rng: np.random.Generator, carried: Carried, scene: SceneTables, start: Array, goal: Array
+) -> Array | None:  # fmt: skip
+    """Return start and goal, shape (2, dof), with a tray at two poses."""
+    return _ends(rng, carried, scene, palms_at(carried, start), palms_at(carried, goal))
+
+
+def _cup_ends(
+    rng: np.random.Generator, carried: Carried, scene: SceneTables, start: scenes.RegionPair, goal: scenes.RegionPair
+) -> Array | None:  # fmt: skip
+    """Return start and goal, shape (2, dof), with upright cups in regions of the hands."""
+    palms = []
+    for regions in (start, goal):
+        points, yaws = zip(*(_level_hand(rng, region) for region in regions), strict=True)
+        palms.append(palms_with_cups(points, yaws))
+    return _ends(rng, carried, scene, palms[0], palms[1])
+
+
+def _level_hand(rng: np.random.Generator, region: HandRegion) -> tuple[Array, float]:
+    """Return a grasp point of a region, and the yaw of level fingers: those of the region, or any that are forward."""
+    level = [fingers for fingers in region.fingers if fingers[2] == 0.0]
+    point, _ = region.sample(rng)
+    if not level:
+        return point, float(rng.uniform(-YAW, YAW))
+    x, y, _ = level[int(rng.integers(len(level)))]
+    return point, float(np.arctan2(y, x) + rng.uniform(-JITTER, JITTER))
+
+
+def _ends(
+    rng: np.random.Generator, carried: Carried, scene: SceneTables, start: Sequence[Array], goal: Sequence[Array]
+) -> Array | None:  # fmt: skip
+    """Return start and goal, shape (2, dof), with the palms at poses: of the goal's states the nearest to the start."""
+    sampler = PalmSampler(carried, scene, MARGIN)
+    starts = sampler.sample(rng, start)
+    if not len(starts):
+        return None
+    first = starts[int(rng.integers(len(starts)))]
+    goals = sampler.sample(rng, goal, near=first)
+    if not len(goals):
+        return None
+    distances = np.abs(goals - first).max(axis=1)
+    best = int(distances.argmin())
+    return np.stack([first, goals[best]]) if distances[best] >= LEAST_MOTION else None
+
