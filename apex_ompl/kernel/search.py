@@ -147,11 +147,7 @@ class TreePair:
             samples = self._random_states(min(iterations, self._at_once))
             iterations -= len(samples)
             while len(samples) and not stop():
-                used = grow_trees(
-                    *self._kernel.packed, *self._buffers.workspace, samples, self._longest, self._resolution,
-                    self._states, self._parents, self._sizes, self._met, np.empty(self._states.shape[2]), self._target,
-                    *self._buffers.proof,
-                )  # fmt: skip
+                used = self._advance(samples)
                 self._failed += used - int(self._met[0] >= 0)
                 if self._met[0] >= 0:
                     return self._path()
@@ -159,6 +155,17 @@ class TreePair:
                 if len(samples):
                     self._make_room()
         return None
+
+    def _advance(self, samples: Array) -> int:
+        """Let the trees grow by random states, shape (N, dof); return how many were used."""
+        return int(grow_trees(*self._arguments(samples)))
+
+    def _arguments(self, samples: Array) -> tuple[Any, ...]:
+        return (
+            *self._kernel.packed, *self._buffers.workspace, samples, self._longest, self._resolution,
+            self._states, self._parents, self._sizes, self._met, np.empty(self._states.shape[2]), self._target,
+            *self._buffers.proof,
+        )  # fmt: skip
 
     def _random_states(self, count: int) -> Array:
         """Return states of which some are uniform in the limits, and some lie around lines from starts to goals.

@@ -215,6 +215,42 @@ RUNS = Group(
 )
 """What a run of the closed loop needs in addition."""
 
+ROWS = "f8[:, ::1], f8, f8, i8, i8[::1], i8[::1], f8[::1], i8"
+
+CONSTRAINED = Group(
+    "what plans under constraints need",
+    25,
+    (
+        {
+            "constraint.projection.project_states": (ROBOT + WORKSPACE + ROBOT + ROWS, 3),
+            "constraint.projection.constraint_norms": (
+                ROBOT + WORKSPACE + ROBOT + "f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], i8",
+                2,
+            ),
+            "constraint.projection.constraint_rows": (
+                ROBOT + WORKSPACE + ROBOT + "f8[::1], f8, i8[::1], f8[::1], i8",
+                2,
+            ),
+            "constraint.search.grow_constrained_trees": (
+                ROBOT + SCENE + WORKSPACE + TREES + PROOF + ", " + ROBOT + "i8, i8, i8[::1], f8[::1], f8[:, ::1]",
+                8,
+            ),
+        },
+        {
+            "constraint.path_optimization.optimize_constrained_path": (
+                ROBOT
+                + SCENE
+                + WORKSPACE
+                + f"f8[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], {SETTINGS}, i8[::1], f8[::1], "
+                + ROBOT
+                + "f8, f8, i8, i8[::1], f8[::1]",
+                12,
+            ),
+        },
+    ),
+)
+"""What plans under constraints need in addition."""
+
 OTHERS: Functions = {
     "geometry.cloud_distance.near_mesh": (
         "f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8[:, ::1], i8[::1], "
@@ -292,5 +328,5 @@ OTHERS: Functions = {
 }
 """What point clouds, grids, inverse kinematics, roadmaps and trainings call; without the library, compiled at need."""
 
-ALL: Functions = {**PLANS.functions, **RUNS.functions, **OTHERS}
+ALL: Functions = {**PLANS.functions, **RUNS.functions, **CONSTRAINED.functions, **OTHERS}
 """All functions that Python calls."""

@@ -24,7 +24,7 @@ from apex_ompl.kernel.compiled.workspace import workspace_view
 
 
 @inlined
-def _nearest(states: Floats, count: int, q: Floats, squares: Floats) -> int:
+def nearest(states: Floats, count: int, q: Floats, squares: Floats) -> int:
     """Return the node of a tree that is nearest to a state; ``states`` are columns, shape (dof, M)."""
     room = squares[:count]
     for n in range(len(room)):
@@ -92,7 +92,7 @@ def grow_trees(
             if sizes[tree] == room:
                 return k
             if near < 0:
-                near = _nearest(states[tree], sizes[tree], target, squares)
+                near = nearest(states[tree], sizes[tree], target, squares)
             square = 0.0
             for i in range(dof):
                 motion[0, i] = states[tree, i, near]

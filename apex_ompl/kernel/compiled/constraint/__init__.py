@@ -1,0 +1,1 @@
+"""Constraints along a path: residuals, projection, path optimization, trees, and proofs."""
