@@ -135,6 +135,19 @@ class RobotError(ApexError):
     """A robot description that is not valid."""
 
 
+class ConstraintError(ApexError):
+    """A constraint along a path that no state satisfies, or that no joint can change.
+
+    Attributes:
+        constraint: Name of the constraint, or names with commas between them.
+    """
+
+    def __init__(self, constraint: str, reason: str) -> None:
+        """Compose the message ``CONSTRAINT: reason``."""
+        self.constraint = constraint
+        super().__init__(f"{constraint}: {reason}")
+
+
 class SceneError(ApexError):
     """A scene change that is not possible, such as removing an obstacle that does not exist."""
 

@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import world_geometry
 from apex_ompl.collision.tables import primitives
+from apex_ompl.constraints.links import Links
 from apex_ompl.errors import SceneError
 from apex_ompl.goals.grasp import grasp
-from apex_ompl.goals.inverse_kinematics import Links
 from apex_ompl.goals.state_sampling import DualArmTables, HandPoseSampler, HandRegion, has_clearance
 from apex_ompl.kernel import Kernel, RobotTables, SceneTables
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of

@@ -19,8 +19,8 @@ from ready_made.specifications import SPECIFICATIONS, AlignmentSpecification, Ha
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.goals.grasp import HandObjects, close_hands
-from apex_ompl.goals.inverse_kinematics import Links, in_world
 from apex_ompl.kernel import offset_target, opposition_target
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check

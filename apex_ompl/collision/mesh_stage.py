@@ -139,7 +139,7 @@ class MeshStage:
         frame = self.model.frames[self._robot.link_frame(held.link)]
         solid = Solid(held.name, int(frame.parentJoint), frame.placement * pin.SE3(pose), shape)
         self.held[held.name] = self._added(solid)
-        default = self._robot.hand_of(held.link)
+        default = (link for holder in held.holders for link in self._robot.hand_of(holder))
         self.touch[held.name] = frozenset(default if held.touch_links is None else held.touch_links)
         return self.held[held.name]
 

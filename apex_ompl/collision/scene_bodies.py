@@ -227,7 +227,7 @@ class SceneBodies:
             FileFormatError: Its mesh file holds no triangles.
         """
         self.check_name(held.name)
-        for link in (held.link, *(held.touch_links or ())):
+        for link in (*held.holders, *(held.touch_links or ())):
             self.robot.link_frame(link)
         held = with_file_read(held)
         geometry = coal_geometry(held)

@@ -23,14 +23,14 @@ Angles are in radians, lengths in meters.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.constraints.frames import LinkFace
+from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.errors import FileFormatError, UnknownNameError
-from apex_ompl.goals.inverse_kinematics import Links, in_world
 from apex_ompl.kernel import Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
@@ -61,54 +61,6 @@ def lowest_direction(axis: Array) -> Array:
     down = -UP + (UP @ axis) * axis
     length = float(np.linalg.norm(down))
     return down / length if length > 1e-9 else -UP
-
-
-@dataclass(frozen=True)
-class LinkFace:
-    """A contact face fixed to a link.
-
-    Attributes:
-        link: The link.
-        point: Center of the face in the link's frame, shape (3,) [m].
-        axis: Outward unit axis in the link's frame, shape (3,).
-    """
-
-    link: str
-    point: Array
-    axis: Array
-
-    @classmethod
-    def of_object(cls, held: AttachedObject) -> LinkFace:
-        """Return the contact face of a held object."""
-        assert held.contact is not None
-        pose = held.pose
-        axis = pose[:3, :3] @ np.asarray(held.contact.axis, float)
-        point = pose[:3, :3] @ np.asarray(held.contact.point, float) + pose[:3, 3]
-        return cls(held.link, point, axis / length(axis))
-
-    @classmethod
-    def of_vector(cls, robot: Robot, vector: WorldVector, start: Array) -> LinkFace:
-        """Return the face given by a vector in the world, fixed to its link at the state ``start``.
-
-        Raises:
-            UnknownNameError: No such link.
-        """
-        pose = robot.link_pose(start, vector.link)
-        tail, tip = np.asarray(vector.tail, float), np.asarray(vector.tip, float)
-        axis = pose[:3, :3].T @ (tip - tail)
-        return cls(vector.link, pose[:3, :3].T @ (tip - pose[:3, 3]), axis / length(axis))
-
-    @classmethod
-    def of_hand(cls, robot: Robot, name: str) -> LinkFace:
-        """Return the grasp point of a hand with the outward normal of its palm.
-
-        Raises:
-            UnknownNameError: No such hand.
-        """
-        if name not in robot.hands:
-            raise UnknownNameError("hand", name, robot.hands)
-        hand = robot.hands[name]
-        return cls(hand.palm, np.asarray(hand.point, float), np.asarray(hand.axis, float))
 
 
 def lip_direction(vessel: AttachedObject) -> Array | None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.errors import UnknownNameError
-from apex_ompl.goals.alignment import LinkFace, angle
-from apex_ompl.goals.inverse_kinematics import Links, in_world
+from apex_ompl.constraints.frames import frame_of
+from apex_ompl.constraints.links import Links, in_world
+from apex_ompl.goals.alignment import angle
 from apex_ompl.kernel import Target, offset_target, opposition_target
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
@@ -20,20 +19,6 @@ from apex_ompl.util.forking import ProcessLock
 
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
 RESIDUAL = 1e-6  # largest residual at which inverse kinematics ends
-
-
-class Frame(NamedTuple):
-    """A frame fixed to a link.
-
-    Attributes:
-        link: The link.
-        pose: Pose in the link's frame, shape (4, 4) [m].
-        axial: Whether it is a contact face, which only has a z axis.
-    """
-
-    link: str
-    pose: Array
-    axial: bool
 
 
 class PoseGoal:
@@ -57,7 +42,7 @@ class PoseGoal:
         self.poses = tuple(poses)
         self.start = np.clip(start, robot.limits.lower, robot.limits.upper)  # as plans clip it
         held = {a.name: a for a in attached}
-        self.frames = tuple(frame_of(robot, pose.frame, held) for pose in self.poses)
+        self.frames = tuple(frame_of(robot, pose.frame, held, "frame of a pose") for pose in self.poses)
         self._numbers = [robot.link_frame(frame.link) for frame in self.frames]
         self._data = robot.model.createData()
         self._lock = ProcessLock()  # of the data
@@ -110,29 +95,6 @@ class PoseGoal:
         """Return the result of inverse kinematics from a state, shape (dof,); it need not reach the poses."""
         found: Array = self.inverse.descend(np.asarray(q, float), tolerance=RESIDUAL).states[0]
         return found
-
-
-def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject]) -> Frame:
-    """Return the frame of a hand, a link or a held object by name.
-
-    Raises:
-        UnknownNameError: There is no such frame.
-    """
-    if name in held:
-        if held[name].contact is None:
-            return Frame(held[name].link, held[name].pose, axial=False)
-        face = LinkFace.of_object(held[name])
-        pose = np.eye(4)
-        pose[:3, :3] = pin.Quaternion.FromTwoVectors(pose[:3, 2], face.axis).matrix()
-        pose[:3, 3] = face.point
-        return Frame(face.link, pose, axial=True)
-    if name in robot.hands:
-        hand, pose = robot.hands[name], np.eye(4)
-        pose[:3, 3] = hand.point
-        return Frame(hand.palm, pose, axial=False)
-    if name in robot.link_names:
-        return Frame(name, np.eye(4), axial=False)
-    raise UnknownNameError("frame of a pose", name, (*robot.hands, *held, *robot.link_names))
 
 
 def rotation_angle(first: Array, second: Array) -> float:

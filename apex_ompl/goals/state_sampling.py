@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.collision.tables import primitives
+from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.goals.alignment import RESTART_SPREAD, AlignmentGoal
 from apex_ompl.goals.grasp import HandObjects, close_hands
-from apex_ompl.goals.inverse_kinematics import Links, in_world
 from apex_ompl.kernel import Kernel, RobotTables, SceneTables, offset_target, opposition_target
 from apex_ompl.kernel.scene_builder import Solids, tables_of
 from apex_ompl.robot import Robot

@@ -9,11 +9,18 @@ from apex_ompl.util.lazy import lazy_names
 if TYPE_CHECKING:
     from apex_ompl.scene.bodies import AttachedObject as AttachedObject
     from apex_ompl.scene.bodies import Obstacle as Obstacle
+    from apex_ompl.scene.constraints import FixedOrientation as FixedOrientation
+    from apex_ompl.scene.constraints import OnLine as OnLine
+    from apex_ompl.scene.constraints import OnPlane as OnPlane
+    from apex_ompl.scene.constraints import Pose as Pose
+    from apex_ompl.scene.constraints import PoseTolerance as PoseTolerance
+    from apex_ompl.scene.constraints import RelativePose as RelativePose
+    from apex_ompl.scene.constraints import ToolRegion as ToolRegion
+    from apex_ompl.scene.constraints import Upright as Upright
     from apex_ompl.scene.points import points_from_depth as points_from_depth
     from apex_ompl.scene.problem import Alignment as Alignment
     from apex_ompl.scene.problem import Goal as Goal
     from apex_ompl.scene.problem import PoseTarget as PoseTarget
-    from apex_ompl.scene.problem import PoseTolerance as PoseTolerance
     from apex_ompl.scene.problem import Problem as Problem
     from apex_ompl.scene.problem import Tolerance as Tolerance
 
@@ -21,7 +28,8 @@ __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "bodies": "AttachedObject Obstacle",
+        "constraints": "FixedOrientation OnLine OnPlane Pose PoseTolerance RelativePose ToolRegion Upright",
         "points": "points_from_depth",
-        "problem": "Alignment Goal PoseTarget PoseTolerance Problem Tolerance",
+        "problem": "Alignment Goal PoseTarget Problem Tolerance",
     },
 )

@@ -6,14 +6,14 @@ Lengths are in meters, masses in kilograms, the world has z up, quaternions are 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
@@ -242,21 +242,62 @@ class ContactFace(StrictModel):
     axis: Direction = (0.0, 0.0, 1.0)
 
 
+def _one_of_both(schema: dict[str, Any]) -> None:
+    """Require a link or links."""
+    schema["required"].remove("link")
+    schema["anyOf"] = [{"required": ["link"]}, {"required": ["links"]}]
+
+
 class AttachedObject(MassiveBody):
     """A held solid, with its pose in the frame of the link that holds it.
 
-    ``touch_links`` are the links that it may touch; None means all links of the hand that holds it.
+    Attributes:
+        link: The link that holds it, by default the first of ``links``.
+        links: Two links that hold it together: it is attached to the first, and the second keeps its pose relative to it
+            along the whole path.
+        touch_links: Links that it may touch; None means all links of the hands that hold it.
+        contact: Its contact face.
     """
 
+    model_config = ConfigDict(json_schema_extra=_one_of_both)
+
     link: Name
+    links: tuple[Name, Name] | None = None
     touch_links: tuple[Name, ...] | None = None
     contact: ContactFace | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _first_of_links(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and "link" not in data:
+            links = data.get("links")
+            if isinstance(links, (list, tuple)) and links:
+                return {**data, "link": links[0]}
+        return data
+
+    @model_validator(mode="after")
+    def _two_links(self) -> Self:
+        if self.links is None:
+            return self
+        if self.links[0] == self.links[1]:
+            raise ValueError(f"{self.name!r}: expected two links that differ")
+        if self.links[0] != self.link:
+            raise ValueError(f"{self.name!r}: expected {self.link!r}, the link, as the first of links")
+        missing = [link for link in self.links if self.touch_links is not None and link not in self.touch_links]
+        if missing:
+            raise ValueError(f"{self.name!r}: expected {missing[0]!r}, which holds it, among touch_links")
+        return self
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
         if self.half_space is not None or self.points is not None:
             raise ValueError(f"{self.name!r}: {'a half_space' if self.half_space else 'points'} cannot be held")
         return self
+
+    @property
+    def holders(self) -> tuple[str, ...]:
+        """The links that hold it: one or two."""
+        return self.links or (self.link,)
 
 
 def given_fields(body: Body, left_out: Collection[str] = ()) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_v
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located
+from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
@@ -99,13 +100,6 @@ class Alignment(StrictModel):
         return self
 
 
-class PoseTolerance(StrictModel):
-    """Tolerance of a pose: distance [m] and angle [rad]."""
-
-    position: PositiveFloat = 1e-3
-    angle: PositiveFloat = 1e-2
-
-
 class PoseTarget(StrictModel):
     """A pose in the world that a frame of the robot is to reach.
 
@@ -165,6 +159,7 @@ class Problem(StrictModel):
         allowed: Pairs of bodies that may touch and overlap: names of links, held objects, obstacles and fixtures.
         start: Joint name -> value of the start state.
         goal: The goal.
+        constraints: What holds along the whole path.
     """
 
     schema_id: Literal["apex-ompl/problem/1"] = Field(default="apex-ompl/problem/1", alias="schema")
@@ -176,8 +171,9 @@ class Problem(StrictModel):
     allowed: tuple[tuple[str, str], ...] = ()
     start: JointValues
     goal: Goal
+    constraints: tuple[AnyConstraint, ...] = ()
 
-    @field_validator("scene", "attached", "allowed", mode="before")
+    @field_validator("scene", "attached", "allowed", "constraints", mode="before")
     @classmethod
     def _nothing_is_empty(cls, value: Any) -> Any:
         return () if value is None else value

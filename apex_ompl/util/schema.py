@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar, dataclass_transform, get_a
 import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, PrivateAttr, ValidationError
+from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
 from apex_ompl.errors import FileFormatError, nearest_name
@@ -365,16 +366,22 @@ def _first_fault(model: type[BaseModel], source: str) -> Iterator[None]:
         faults = error.errors()
         # A misspelt key is reported as a missing key too; the misspelling is more informative.
         first = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-        location = [str(part) for part in first["loc"]]
+        location, _ = _without_tags(model, first["loc"])
         expected = first["msg"][0].lower() + first["msg"][1:]
         value = first["input"]
         if first["type"] == "extra_forbidden":
-            known = _known_keys(model, first["loc"][:-1])
+            known = _keys(_without_tags(model, first["loc"][:-1])[1])
             near = nearest_name(location[-1], known)
             hint = f"did you mean {near!r}?" if near else f"known: {', '.join(sorted(known))}"
             expected, value = f"unknown key, {hint}", location[-1]
         elif first["type"] == "missing":
             expected, value = "required key is missing", sorted(map(str, value)) if value else value
+        elif first["type"] == "union_tag_not_found":
+            location.append(first["ctx"]["discriminator"].strip("'"))
+            expected, value = "required key is missing", sorted(map(str, value))
+        elif first["type"] == "union_tag_invalid":
+            location.append(first["ctx"]["discriminator"].strip("'"))
+            expected, value = f"expected one of {first['ctx']['expected_tags']}", first["ctx"]["tag"]
         elif first["type"] == "value_error":
             expected = str(first["ctx"]["error"])
         elif first["type"] == "bool_type":
@@ -402,20 +409,42 @@ def replaced(data: dict[str, Any], changes: Mapping[str, Any], source: str) -> d
     return data
 
 
-def _known_keys(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
-    """Return the keys that the record at ``location`` inside ``model`` accepts."""
+def _without_tags(
+    model: type[BaseModel], location: tuple[int | str, ...]
+) -> tuple[list[str], type[BaseModel] | None]:  # fmt: skip
+    """Return pydantic's location inside ``model`` without the tags of unions, and the kind of record there, if any."""
+    path: list[str] = []
     current: type[BaseModel] | None = model
     free_key = False  # the next part is the key of a mapping, not a field
+    tagged: dict[str, type[BaseModel]] = {}
     for part in location:
+        if isinstance(part, str) and part in tagged:
+            current, tagged = tagged[part], {}
+            continue
+        path.append(str(part))
         if isinstance(part, int) or current is None or free_key:
             free_key = False
             continue
         field = next((f for n, f in current.model_fields.items() if part in (n, f.alias)), None)
-        current = _model_in(field.annotation) if field else None
+        tagged = _tagged(field.annotation) if field else {}
+        current = _model_in(field.annotation) if field and not tagged else None
         free_key = field is not None and get_origin(field.annotation) is dict
-    if current is None:
-        return set()
-    return {field.alias or name for name, field in current.model_fields.items()}
+    return path, current
+
+
+def _keys(model: type[BaseModel] | None) -> set[str]:
+    """Return the keys that a record accepts."""
+    return {field.alias or name for name, field in model.model_fields.items()} if model else set()
+
+
+def _tagged(annotation: Any) -> dict[str, type[BaseModel]]:
+    """Return tag -> record type of a union with a discriminator inside an annotation; empty where there is none."""
+    inside = get_args(annotation)
+    for mark in inside[1:]:
+        if isinstance(mark, FieldInfo) and isinstance(mark.discriminator, str):
+            kinds = get_args(inside[0])
+            return {tag: kind for kind in kinds for tag in get_args(kind.model_fields[mark.discriminator].annotation)}
+    return next((found for inner in inside if (found := _tagged(inner))), {})
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
@@ -434,7 +463,7 @@ class _Dumper(getattr(yaml, "CSafeDumper", yaml.SafeDumper)):  # type: ignore[mi
 
 
 def _represent_sequence(dumper: _Dumper, data: Any) -> yaml.SequenceNode:
-    flat = all(isinstance(v, (int, float)) for v in data)
+    flat = all(v is None or isinstance(v, (int, float)) for v in data)
     node: yaml.SequenceNode = dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=flat)
     return node
 

@@ -10,16 +10,17 @@ from scipy.spatial.transform import Rotation
 
 from apex_ompl import PlanStatus, load_problem, plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import alignment_goal
 from apex_ompl.goals.goal_sampling import sample
-from apex_ompl.goals.inverse_kinematics import Links, in_world
 from apex_ompl.goals.pose_goal import PoseGoal
 from apex_ompl.kernel import IKSolver, offset_target, opposition_target
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.robot import Robot
 from apex_ompl.robot.rest_to_rest import direct_durations
-from apex_ompl.scene.problem import Goal, PoseTarget, PoseTolerance, Problem
+from apex_ompl.scene.constraints import PoseTolerance
+from apex_ompl.scene.problem import Goal, PoseTarget, Problem
 from apex_ompl.timing.duration import DurationOptimizer
 
 ALIGNED = ("ball_in_cup", "peg_in_hole", "pour", "handover", "stack_boxes")

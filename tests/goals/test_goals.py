@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from apex_ompl import PlanStatus, load_problem, plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.links import Links
 from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal, angle
 from apex_ompl.goals.goal_sampling import sample
-from apex_ompl.goals.inverse_kinematics import Links
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, ContactFace
@@ -216,7 +216,7 @@ def test_contact_faces_turn_with_their_object() -> None:
         name="x", link="l", sphere={"radius": 0.1}, position=(1.0, 0.0, 0.0),
         orientation=(0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)), contact=face,
     )  # fmt: skip
-    from apex_ompl.goals.alignment import LinkFace
+    from apex_ompl.constraints.frames import LinkFace
 
     found = LinkFace.of_object(turned)
     np.testing.assert_allclose(found.point, [1.1, 0.0, 0.0], atol=1e-12)

@@ -15,8 +15,8 @@ From the top, as CONTRIBUTING has it:
    OMPL.
 8. `goals`: alignments, poses, grasps, inverse kinematics; `timing`: motions over time; `model`: inference without
    torch.
-9. `collision`: the checker, spheres before meshes; `paths`: splines, the optimizer; `robot`: Pinocchio models, MoveIt's
-   files.
+9. `constraints`: what holds along a path; `collision`: the checker, spheres before meshes; `paths`: splines, the
+   optimizer; `robot`: Pinocchio models, MoveIt's files.
 10. `kernel`: wrappers of compiled code over flat arrays; `scene`: problem files and bodies; `util`, `types`, `errors`.
 """
 
@@ -37,6 +37,7 @@ LAYERS = [
     {"robot"},
     {"paths"},
     {"collision"},
+    {"constraints"},
     {"goals", "timing", "model"},
     {"ompl"},
     {"moving"},

@@ -12,8 +12,9 @@ import numpy as np
 
 from apex_ompl import planners
 from apex_ompl.apex.parameters import NAME
+from apex_ompl.constraints.frames import frame_of
 from apex_ompl.errors import ApexError, ParameterError
-from apex_ompl.goals.pose_goal import PoseGoal, frame_of
+from apex_ompl.goals.pose_goal import PoseGoal
 from apex_ompl.planning import MotionPlanner
 from apex_ompl.scene.bodies import pose_fields
 from apex_ompl.scene.problem import PoseTarget, Problem

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.goals.inverse_kinematics import Links, in_world
 from apex_ompl.kernel import FixedVector, Target, angle_target, offset_target, opposition_target
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.config import DATA

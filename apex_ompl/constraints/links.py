@@ -1,4 +1,4 @@
-"""Inverse kinematics of links: points and directions fixed to them, as residuals of the kernel's solver."""
+"""Points, directions and frames fixed to the links of a robot, given in the frames of joints as the kernel does."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import FixedVector, IKSolver, RobotTables, Target
 from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.robot import Robot
+from apex_ompl.types import Array
 from apex_ompl.util.forking import ProcessLock
 
 
@@ -23,7 +24,7 @@ def in_world(vector: ArrayLike) -> FixedVector:
 
 
 class Links:
-    """Points and directions fixed to the links of a robot, for the targets of the solver; safe for several threads."""
+    """Points, directions and frames fixed to the links of a robot; safe for several threads."""
 
     def __init__(self, robot: Robot) -> None:
         """Tabulate the joints of ``robot``.
@@ -66,6 +67,28 @@ class Links:
         """
         joint, placement = self._placement(link)
         return FixedVector(joint, self._turns[joint].T @ placement.rotation @ np.asarray(direction, float))
+
+    def frame(self, link: str, pose: Array) -> tuple[int, Array]:
+        """Return the joint of a frame given in that of a link, and its pose in the joint's frame, shapes (4, 4) [m].
+
+        Raises:
+            UnknownNameError: No such link.
+        """
+        joint, placement = self._placement(link)
+        placed = pin.SE3(self._turns[joint].T, np.zeros(3)) * placement * pin.SE3(pose[:3, :3], pose[:3, 3])
+        return joint, np.array(placed.homogeneous)
+
+    def moved(self, first: int, second: int = 0) -> tuple[int, ...]:
+        """Return the planned joints that move one joint's frame relative to another's, the world's by default."""
+        arrays, sides = self.tables.arrays, []
+        for joint in (first, second):
+            above, k = set(), joint
+            while k > 0:
+                above.add(k)
+                k = int(arrays.joint_parent[k])
+            sides.append(above)
+        planned = {int(arrays.joint_source[k]) for k in sides[0] ^ sides[1]}
+        return tuple(sorted(planned - {-1}))
 
     def inverse(self, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()) -> IKSolver:
         """Return the inverse kinematics of targets; the planned joints with indices ``fixed`` are not moved."""
