@@ -1,14 +1,14 @@
 """Levels with constraints: ``tray``, ``level`` and ``cups`` of some suites.
 
-On ``tray`` both hands hold one tray, so that their relative pose stays as at the start. On ``level`` a cup stands on the
-tray, which also stays level. On ``cups`` each hand keeps a cup upright. Cups go through the scenes of the suites
-themselves, trays through those of :mod:`apex_ompl.problems.constrained_scenes`. On ``unseen`` the grammars of that suite
-take turns by the seed; their composition stands somewhere, or where the hands pass, without the parts that are too near
-to the start or to the goal.
+On ``tray`` both hands hold one tray, so that their relative pose stays as at the start. On ``level`` a cup stands on
+the tray, which also stays level. On ``cups`` each hand keeps a cup upright. Cups go through the scenes of the suites
+themselves, trays through those of :mod:`apex_ompl.problems.constrained_scenes`. On ``unseen`` the grammars of that
+suite take turns by the seed; their composition stands somewhere, or where the hands pass, without the parts that are
+too near to the start or to the goal.
 
-Starts and goals are on the constraint, and free by a margin; of the goal's states on many branches of inverse kinematics
-the nearest one to the start is taken. Of ``clutter`` and ``unseen`` most problems are drawn anew where the straight
-line, moved to the constraint, is free.
+Starts and goals are on the constraint, and free by a margin; of the goal's states on many branches of inverse
+kinematics the nearest one to the start is taken. Of ``clutter`` and ``unseen`` most problems are drawn anew where the
+straight line, moved to the constraint, is free.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from apex_ompl.goals.state_sampling import HandRegion, scene_kernel
 from apex_ompl.kernel import SceneTables
 from apex_ompl.problems import constrained_scenes, scenes
 from apex_ompl.problems.broad import MOST_OBSTACLES, ROUNDING, UNSEEN, composition, in_the_way, near
-from apex_ompl.problems.broad_representation import draw_representation, feasible, obstacles
+from apex_ompl.problems.broad_representation import Group, draw_representation, feasible, obstacles
 from apex_ompl.problems.broad_tasks import SHOULDERS, clear_parts, palm_line, scene_of
 from apex_ompl.problems.broad_unseen import STRANGERS
 from apex_ompl.problems.constrained_ends import PalmSampler, line_is_free, palms_at, palms_with_cups
@@ -64,7 +64,13 @@ def draw(rng: np.random.Generator, suite: str, kind: str, seed: int) -> DrawnPro
         assert carried.tray is not None
         tray = constrained_scenes.SCENES[suite](rng, kind, carried.tray)
         scene, ends = tray.scene, _tray_ends(rng, carried, _tables(tray.scene, carried), tray.start, tray.goal)
-    return None if ends is None else DrawnProblem(scene, ends[0], ends[1], carried.held.attached)
+    return None if ends is None else _drawn(carried, scene, ends)
+
+
+def _drawn(
+    carried: Carried, scene: tuple[Obstacle, ...], ends: Array, groups: tuple[Group, ...] = ()
+) -> DrawnProblem:  # fmt: skip
+    return DrawnProblem(scene, ends[0], ends[1], carried.held.attached, groups, carried.constraints)
 
 
 def _tables(scene: Sequence[Obstacle], carried: Carried) -> SceneTables:
@@ -80,8 +86,8 @@ def _tray_in_clutter(rng: np.random.Generator, carried: Carried, kind: str) -> D
         if ends is None:
             continue
         scene = tuple(body for body in task.scene if _keeps_clear(carried, body, ends))
-        if easy or not line_is_free(carried, kind, _tables(scene, carried), ends):
-            return DrawnProblem(scene, ends[0], ends[1], carried.held.attached)
+        if easy or not line_is_free(carried, _tables(scene, carried), ends):
+            return _drawn(carried, scene, ends)
     return None
 
 
@@ -102,10 +108,10 @@ def _among_parts(rng: np.random.Generator, carried: Carried, kind: str, grammar:
         if rng.random() < MET:
             found = in_the_way(rng, found, palm_line(carried.held.tables.both, ends, 9).reshape(-1, 3))
         parts = clear_parts(carried.held.tables.both, near(found.parts)[:MOST_OBSTACLES], ends, margin)
-        if easy or not line_is_free(carried, kind, scene_of(parts, representation.swelling), ends):
+        if easy or not line_is_free(carried, scene_of(parts, representation.swelling), ends):
             groups = representation.groups(len(parts))
             groups = groups if feasible(parts, groups) else ()
-            return DrawnProblem(obstacles(parts), ends[0], ends[1], carried.held.attached, groups)
+            return _drawn(carried, obstacles(parts), ends, groups)
     return None
 
 
@@ -166,4 +172,3 @@ def _ends(
     distances = np.abs(goals - first).max(axis=1)
     best = int(distances.argmin())
     return np.stack([first, goals[best]]) if distances[best] >= LEAST_MOTION else None
-

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from apex_ompl.goals.inverse_kinematics import Links, in_world
+from apex_ompl.constraints.constraint_set import ConstraintSet
+from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.goals.pose_goal import POSITION_WEIGHT
 from apex_ompl.goals.state_sampling import has_clearance
-from apex_ompl.kernel import IKSolver, Kernel, SceneTables, Target, offset_target, opposition_target
-from apex_ompl.problems.constrained_held import LEVEL, Carried, upright_palm
+from apex_ompl.kernel import IKSolver, Kernel, SceneTables, offset_target, opposition_target
+from apex_ompl.problems.constrained_held import Carried, upright_palm
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.types import Array, Flags
 
@@ -28,7 +29,7 @@ STEPS = 60  # most steps of a descent
 ARM_STATES = 8  # of one arm that are combined with those of the other one
 LIMIT_GAP = 0.02  # of arm joints to their limits, where a closed chain ends [rad]
 LINE_STATES = 15  # at which the straight line is looked up, between start and goal
-LINE_TOLERANCE = 1e-4  # residual of these states
+LINE_MARGIN = 1e-6  # clearance of these states [m]
 
 
 class PalmSampler:
@@ -91,39 +92,19 @@ def inside_limits(states: Array) -> Flags:
     return np.asarray(((states[:, arms] >= low) & (states[:, arms] <= high)).all(axis=1), bool)
 
 
-def constraint_targets(carried: Carried, kind: str) -> list[Target]:
-    """Return the residuals of the constraint of a kind: the chain of a tray, and what stays upright."""
-    links, hands = Links.of(robot()), tuple(robot().hands.values())
-    up = in_world((0.0, 0.0, 1.0))
-    if carried.tray is None:
-        along = [upright_palm(side, np.array([1.0, 0.0, 0.0])).T @ (0.0, 0.0, 1.0) for side in (0, 1)]
-        axes = [links.direction(hand.palm, axis) for hand, axis in zip(hands, along, strict=True)]
-        return [opposition_target(axis, up, -1.0) for axis in axes]
-    trays = [np.linalg.inv(carried.tray.palm(side)) for side in (0, 1)]
-    points = [links.point(hand.palm, pose[:3, 3]) for hand, pose in zip(hands, trays, strict=True)]
-    targets = [offset_target(points[0], points[1], weight=POSITION_WEIGHT)]
-    for k in (0, 2):
-        axes = [links.direction(hand.palm, pose[:3, k]) for hand, pose in zip(hands, trays, strict=True)]
-        targets.append(opposition_target(axes[0], axes[1], -1.0))
-    if kind == LEVEL:
-        targets.append(opposition_target(links.direction(hands[0].palm, trays[0][:3, 2]), up, -1.0))
-    return targets
-
-
-def line_is_free(carried: Carried, kind: str, scene: SceneTables, ends: Array) -> bool:
-    """Whether the straight line, its states moved to the constraint by inverse kinematics, is clear of a scene.
+def line_is_free(carried: Carried, scene: SceneTables, ends: Array) -> bool:
+    """Whether the straight line, its states moved to the constraints, is clear of a scene.
 
     Args:
-        carried: What is carried.
-        kind: One of ``KINDS``.
+        carried: What is carried, under which constraints.
         scene: The kernel's tables of the scene.
         ends: Start and goal, shape (2, dof).
     """
-    inverse = Links.of(robot()).inverse(constraint_targets(carried, kind), robot().groups["hands"])
+    constraints = ConstraintSet.of(robot(), carried.constraints, carried.held.attached, ends[0])
     line = np.linspace(ends[0], ends[1], LINE_STATES + 2)[1:-1]
-    moved = inverse.descend(line, tolerance=LINE_TOLERANCE, max_steps=STEPS)
-    reached = bool((moved.errors < 10.0 * LINE_TOLERANCE).all())
-    return reached and bool(has_clearance(Kernel(carried.held.tables.both, scene), moved.states, 1e-6).all())
+    moved = constraints.project(line)
+    kernel = Kernel(carried.held.tables.both, scene)
+    return bool(moved.ok.all()) and bool(has_clearance(kernel, moved.states, LINE_MARGIN).all())
 
 
 def palms_at(carried: Carried, pose: Array) -> list[Array]:

@@ -18,6 +18,7 @@ from apex_ompl.problems.broad_tasks import Held
 from apex_ompl.problems.objects import cup
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import AttachedObject, pose_fields
+from apex_ompl.scene.constraints import Upright
 from apex_ompl.types import Array
 
 TRAY, LEVEL, CUPS = "tray", "level", "cups"
@@ -65,10 +66,12 @@ class Carried:
 
     Attributes:
         held: The objects with the robot's tables.
+        constraints: What holds along a path, beside the chain that a tray closes.
         tray: Measures of the tray; None for cups.
     """
 
     held: Held
+    constraints: tuple[Upright, ...] = ()
     tray: TraySize | None = None
 
 
@@ -84,17 +87,18 @@ def draw_carried(rng: np.random.Generator, kind: str) -> Carried:
 def carried_tray(size: TraySize, *, loaded: bool) -> Carried:
     """Return a tray in both hands, with a cup on it where it is ``loaded``."""
     left, right = robot().hands.values()
-    touched = (*robot().hand_of(left.palm), *robot().hand_of(right.palm))
     in_palm = np.linalg.inv(size.palm(0))
     box = (size.depth, 2.0 * size.half_length, THICKNESS)
-    bodies = [AttachedObject(name="tray", box=box, link=left.palm, touch_links=touched, **_rounded(in_palm))]
+    tray = {"name": "tray", "box": box, "links": (left.palm, right.palm), **_rounded(in_palm)}
+    bodies = [AttachedObject.model_validate(tray)]
     if loaded:
         pose = np.eye(4)
         pose[:3, 3] = 0.0, 0.25 * size.half_length, (THICKNESS + CARGO_LENGTH) / 2.0 + CARGO_GAP
         cylinder = {"radius": CARGO_RADIUS, "length": CARGO_LENGTH}
-        fields = {"name": "cargo", "cylinder": cylinder, "link": left.palm, **_rounded(in_palm @ pose)}
-        bodies.append(AttachedObject.model_validate(fields))
-    return Carried(Held.of(bodies, (SYNERGY,) * 2, (SYNERGY,) * 2), size)
+        cargo = {"name": "cargo", "cylinder": cylinder, "link": left.palm, "touch_links": ()}
+        bodies.append(AttachedObject.model_validate({**cargo, **_rounded(in_palm @ pose)}))
+    upright = (Upright(frame="tray", angle=LEVEL_ANGLE),) if loaded else ()
+    return Carried(Held.of(bodies, (SYNERGY,) * 2, (SYNERGY,) * 2), upright, size)
 
 
 @cache
@@ -103,7 +107,8 @@ def _cups() -> Carried:
     objects = [("left_hand", cup("left_cup", 1)), ("right_hand", cup("right_cup", -1))]
     attached, home, _ = close_hands(robot(), objects)
     synergies = home[robot().groups["hands"]].tolist()
-    return Carried(Held.of(attached, synergies, synergies))
+    upright = tuple(Upright(frame=body.name, angle=CUP_ANGLE) for body in attached)
+    return Carried(Held.of(attached, synergies, synergies), upright)
 
 
 def upright_palm(side: int, fingers: Array) -> Array:

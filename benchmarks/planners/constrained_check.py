@@ -1,8 +1,8 @@
-"""What the rivals under constraints share: the problem as they take it, and the check of their paths.
+"""What the rivals under constraints share: the check of their paths.
 
 The check is independent of the kernel: constraints are evaluated by Pinocchio from the record of the problem, and
-collisions by the meshes, at states twenty times as dense as those of the search. A rival's path is refined before it, in
-its favor: states between its own are moved to the constraint. Its times do not include refinement and check.
+collisions by the meshes, at states twenty times as dense as those of the search. A rival's path is refined before it,
+in its favor: states between its own are moved to the constraint. Its times do not include refinement and check.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length, states_between
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import pose_matrix
-from apex_ompl.scene.constraints import FixedOrientation, OnLine, OnPlane, RelativePose, ToolRegion, Upright
+from apex_ompl.scene.constraints import FixedOrientation, OnLine, OnPlane, RelativePose, Upright
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
@@ -163,7 +163,8 @@ def dense_check(robot: Robot, problem: Problem, path: Array, spacing: float = DE
         path: Shape (N, dof).
         spacing: Of the states that are checked [rad, max-norm].
     """
-    states = np.concatenate([path[:1], *(states_between(a, b, spacing) for a, b in pairwise(path)), path[-1:]])
+    stretches = (np.concatenate([states_between(a, b, spacing), b[None]]) for a, b in pairwise(path))
+    states = np.concatenate([path[:1], *stretches])
     reader = FrameReader(robot, problem)
     start = problem.start_state(robot.joint_names)
     worst = 0.0

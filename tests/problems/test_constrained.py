@@ -14,6 +14,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems import constrained
 from apex_ompl.problems.catalogue import CONSTRAINED, ProblemId, first_drawn, levels_of
+from apex_ompl.problems.broad_tasks import Held
 from apex_ompl.problems.constrained_ends import line_is_free
 from apex_ompl.problems.constrained_held import CUP_ANGLE, LEVEL_ANGLE, SYNERGY, TraySize, carried_tray
 from apex_ompl.problems.frozen import digest
@@ -54,6 +55,9 @@ def test_starts_and_goals_keep_the_constraint_and_a_centimeter(robot: Robot, sui
         states = ends(problem, robot)
         (left, right), (left_goal, right_goal) = (palms(robot, q) for q in states)
         if level == "cups":
+            assert [(c.kind, c.frame, c.angle) for c in problem.constraints] == [
+                ("upright", "left_cup", CUP_ANGLE), ("upright", "right_cup", CUP_ANGLE),
+            ]  # fmt: skip
             assert [body.name for body in problem.attached] == ["left_cup", "right_cup"]
             for at_start, at_goal, body in ((left, left_goal, 0), (right, right_goal, 1)):
                 for palm in (at_start, at_goal):
@@ -64,6 +68,8 @@ def test_starts_and_goals_keep_the_constraint_and_a_centimeter(robot: Robot, sui
             assert np.linalg.norm(moved[:3, 3]) < ON and np.linalg.norm(pin.log3(moved[:3, :3])) < ON
             tray = problem.attached[0]
             tilts = [axis_angle((p @ tray.pose)[:3, 2], np.array([0.0, 0.0, 1.0])) for p in (left, left_goal)]
+            assert tray.links == tuple(hand.palm for hand in robot.hands.values())
+            assert [(c.frame, c.angle) for c in problem.constraints] == [("tray", LEVEL_ANGLE)] * (level == "level")
             assert tray.name == "tray" and (level != "level" or max(tilts) < min(ON, LEVEL_ANGLE))
             assert [body.name for body in problem.attached[1:]] == ["cargo"] * (level == "level")
         checker = CollisionChecker(robot, problem.scene, problem.attached, proofs=False)
@@ -106,19 +112,15 @@ def test_palms_hold_a_tray_at_its_ends(robot: Robot) -> None:
     assert (carried_tray(size, loaded=False).held.low == SYNERGY).all()
 
 
-def test_most_straight_lines_are_blocked_in_clutter_and_among_unseen_parts() -> None:
+def test_most_straight_lines_are_blocked_in_clutter_and_among_unseen_parts(robot: Robot) -> None:
     free = 0
     for suite, level in (("clutter", "tray"), ("unseen", "level"), ("unseen", "cups")):
         for seed in range(4):
             drawn = first_drawn(ProblemId(suite, level, UNFROZEN + seed))[1]
-            kernel = CollisionChecker(constrained.robot(), drawn.scene, drawn.attached).kernel
-            held = constrained.draw_carried(np.random.default_rng(0), level)
-            if level != "cups":
-                box = drawn.attached[0].box
-                sizes = [TraySize(box[1] / 2, box[0], pitch) for pitch in constrained.PITCHES]
-                fits = [s for s in sizes if carried_tray(s, loaded=level == "level").held.attached == drawn.attached]
-                held = carried_tray(fits[0], loaded=level == "level")
-            free += line_is_free(held, level, kernel.scene, np.stack([drawn.start, drawn.goal]))
+            kernel = CollisionChecker(robot, drawn.scene, drawn.attached).kernel
+            attached, line = drawn.attached, np.stack([drawn.start, drawn.goal])
+            held = constrained.Carried(Held.of(attached, (0.5, 0.5), (0.5, 0.5)), drawn.constraints)
+            free += line_is_free(held, kernel.scene, line)
     assert free <= 6
 
 
