@@ -7,8 +7,7 @@ suite take turns by the seed; their composition stands somewhere, or where the h
 too near to the start or to the goal.
 
 Starts and goals are on the constraint, and free by a margin; of the goal's states on many branches of inverse
-kinematics the nearest one to the start is taken. Of ``clutter`` and ``unseen`` most problems are drawn anew where the
-straight line, moved to the constraint, is free.
+kinematics the nearest one to the start is taken. Of most problems the straight line, moved to the constraint, collides.
 """
 
 from __future__ import annotations
@@ -35,36 +34,35 @@ LEVELS = dict.fromkeys(SUITES, KINDS)
 """Suite -> its levels with constraints."""
 
 DIFFICULTIES = ("easy", "medium", "hard")  # of the scenes that cups go through
-LEAST_MOTION = 0.5  # of some joint from start to goal [rad]
-EASY = 0.15  # share of scenes that are taken though the straight line is free
-TRIES = 6  # scenes of one draw, until the line is not free
+LEAST_MOTION, MOST_MOTION = 0.5, 3.5  # of the joint that moves most from start to goal [rad]
+ANY_LINE = 7  # of so many problems one may have a straight line that is free
 MET = 0.6  # share of compositions that are put in the way
 YAW = 0.6  # largest yaw of the fingers of a hand that is not sent along a direction [rad]
 JITTER = 0.15  # largest yaw of the fingers of one that is [rad]
 
 
 def draw(rng: np.random.Generator, suite: str, kind: str, seed: int) -> DrawnProblem | None:
-    """Draw a problem of a suite; None when this draw has no start or no goal.
+    """Draw a problem of a suite; None when this draw has no start or no goal, or its straight line is free.
 
     Args:
         rng: Source of everything but the grammar.
         suite: One of ``SUITES``.
         kind: One of ``KINDS``, the level.
-        seed: Of the problem, by which grammars take turns.
+        seed: Of the problem, by which grammars take turns; of every ``ANY_LINE``-th one the straight line may be free.
     """
     carried = draw_carried(rng, kind)
     if suite == UNSEEN:
-        return _among_parts(rng, carried, kind, tuple(STRANGERS)[seed % len(STRANGERS)])
-    if kind == CUPS:
+        found = _among_parts(rng, carried, kind, tuple(STRANGERS)[seed % len(STRANGERS)])
+    elif kind == CUPS:
         task = scenes.SUITES[suite](rng, DIFFICULTIES[int(rng.integers(len(DIFFICULTIES)))])
-        scene, ends = task.scene, _cup_ends(rng, carried, _tables(task.scene, carried), task.start, task.goal)
-    elif suite == "clutter":
-        return _tray_in_clutter(rng, carried, kind)
+        ends = _cup_ends(rng, carried, _tables(task.scene, carried), task.start, task.goal)
+        found = None if ends is None else _drawn(carried, task.scene, ends)
     else:
-        assert carried.tray is not None
-        tray = constrained_scenes.SCENES[suite](rng, kind, carried.tray)
-        scene, ends = tray.scene, _tray_ends(rng, carried, _tables(tray.scene, carried), tray.start, tray.goal)
-    return None if ends is None else _drawn(carried, scene, ends)
+        found = _with_tray(rng, carried, suite, kind)
+    if found is None or seed % ANY_LINE == 0:
+        return found
+    is_free = line_is_free(carried, _tables(found.scene, carried), np.stack([found.start, found.goal]))
+    return None if is_free else found
 
 
 def _drawn(
@@ -77,18 +75,16 @@ def _tables(scene: Sequence[Obstacle], carried: Carried) -> SceneTables:
     return scene_kernel(robot(), carried.held.tables.both, scene).scene
 
 
-def _tray_in_clutter(rng: np.random.Generator, carried: Carried, kind: str) -> DrawnProblem | None:
+def _with_tray(rng: np.random.Generator, carried: Carried, suite: str, kind: str) -> DrawnProblem | None:
     assert carried.tray is not None
-    easy = rng.random() < EASY
-    for _ in range(TRIES):
-        task = constrained_scenes.clutter(rng, kind, carried.tray)
-        ends = _tray_ends(rng, carried, scene_of(()), task.start, task.goal)
-        if ends is None:
-            continue
-        scene = tuple(body for body in task.scene if _keeps_clear(carried, body, ends))
-        if easy or not line_is_free(carried, _tables(scene, carried), ends):
-            return _drawn(carried, scene, ends)
-    return None
+    task = constrained_scenes.SCENES[suite](rng, kind, carried.tray)
+    loose = suite == "clutter"  # what is too near to an end is left out
+    scene = scene_of(()) if loose else _tables(task.scene, carried)
+    ends = _tray_ends(rng, carried, scene, task.start, task.goal)
+    if ends is None:
+        return None
+    kept = tuple(body for body in task.scene if not loose or _keeps_clear(carried, body, ends))
+    return _drawn(carried, kept, ends)
 
 
 def _keeps_clear(carried: Carried, body: Obstacle, ends: Array) -> bool:
@@ -98,21 +94,17 @@ def _keeps_clear(carried: Carried, body: Obstacle, ends: Array) -> bool:
 
 def _among_parts(rng: np.random.Generator, carried: Carried, kind: str, grammar: str) -> DrawnProblem | None:
     """Draw a problem among the parts of a grammar of ``unseen``."""
-    representation, easy = draw_representation(rng), rng.random() < EASY
+    representation = draw_representation(rng)
+    ends = _ends_anywhere(rng, carried, kind, scene_of(()))
+    if ends is None:
+        return None
+    found, tables = composition(rng, UNSEEN, STRANGERS[grammar]), carried.held.tables.both
+    if rng.random() < MET:
+        found = in_the_way(rng, found, palm_line(tables, ends, 9).reshape(-1, 3))
     margin = MARGIN + ROUNDING + representation.swelling
-    for _ in range(TRIES):
-        ends = _ends_anywhere(rng, carried, kind, scene_of(()))
-        if ends is None:
-            continue
-        found = composition(rng, UNSEEN, STRANGERS[grammar])
-        if rng.random() < MET:
-            found = in_the_way(rng, found, palm_line(carried.held.tables.both, ends, 9).reshape(-1, 3))
-        parts = clear_parts(carried.held.tables.both, near(found.parts)[:MOST_OBSTACLES], ends, margin)
-        if easy or not line_is_free(carried, scene_of(parts, representation.swelling), ends):
-            groups = representation.groups(len(parts))
-            groups = groups if feasible(parts, groups) else ()
-            return _drawn(carried, obstacles(parts), ends, groups)
-    return None
+    parts = clear_parts(tables, near(found.parts)[:MOST_OBSTACLES], ends, margin)
+    groups = representation.groups(len(parts))
+    return _drawn(carried, obstacles(parts), ends, groups if feasible(parts, groups) else ())
 
 
 def _ends_anywhere(rng: np.random.Generator, carried: Carried, kind: str, scene: SceneTables) -> Array | None:
@@ -171,4 +163,4 @@ def _ends(
         return None
     distances = np.abs(goals - first).max(axis=1)
     best = int(distances.argmin())
-    return np.stack([first, goals[best]]) if distances[best] >= LEAST_MOTION else None
+    return np.stack([first, goals[best]]) if LEAST_MOTION <= distances[best] <= MOST_MOTION else None

@@ -7,7 +7,7 @@ in its favor: states between its own are moved to the constraint. Its times do n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.constraints import ConstraintSet
+from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.constraints.frames import frame_of
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length, states_between
@@ -144,6 +144,12 @@ def _relative(constraint: RelativePose, start: Mapping[str, Array]) -> Residual:
     return worst
 
 
+def arm_joints(ready: PlanningSetup) -> Array:
+    """Return the numbers of the planned joints that do not close a hand, shape (n,)."""
+    hands = {hand.synergy for hand in ready.robot.hands.values()}
+    return np.array([k for k, name in enumerate(ready.robot.joint_names) if name not in hands])
+
+
 def all_constraints(problem: Problem) -> tuple[Any, ...]:
     """Return the constraints of a problem, with the chains that objects in two hands close."""
     chains = [
@@ -189,32 +195,33 @@ def refined(constraints: ConstraintSet, path: Array, spacing: float = REFINED) -
     return np.concatenate(rows)
 
 
-def columns(ready: PlanningSetup, constraints: ConstraintSet, path: Array | None, times: dict[str, float], reason: str,
-            first: Array | None = None) -> dict[str, Any]:  # fmt: skip
+def columns(
+    ready: PlanningSetup, constraints: ConstraintSet, paths: Sequence[Array], times: dict[str, float], reason: str = ""
+) -> dict[str, Any]:  # fmt: skip
     """Return the columns of a rival's run.
 
     Args:
         ready: The problem, ready to plan.
         constraints: Its constraints.
-        path: The final path, shape (N, dof); None where none was found.
-        times: Times of the stages [s]; those of planner and simplification make up the run.
+        paths: The final path, shape (N, dof), then that before simplification, which is tried where the final one fails
+            the check; none where none was found.
+        times: Times of the stages [s]; ``solve`` and ``simplify`` make up the run.
         reason: Why there is no path.
-        first: The path before simplification, which is tried where the final one fails the check.
     """
     found, check = None, None
-    for states in (path, first):
-        if states is None or found is not None:
-            continue
+    for states in paths:
+        if found is not None:
+            break
         with timed(times, "check"):
             dense = refined(constraints, states)
             check = dense_check(ready.robot, ready.problem, dense)
         found = dense if check else None
-    if path is not None and found is None and check is not None:
+    if found is None and check is not None:
         reason = f"violation {check.violation:.2f} of the tolerance" if check.free else "the path collides"
     total = times.get("solve", 0.0) + times.get("simplify", 0.0)
     return {
         "solved": found is not None, "first": times["solve"] if found is not None else None, "total": total,
         "times": times, "length": None if found is None else path_length(found), "reason": reason,
-        "failed_check": path is not None and found is None,
+        "failed_check": len(paths) > 0 and found is None,
         "violation": None if check is None else check.violation,
     }  # fmt: skip

@@ -13,8 +13,8 @@ from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems import constrained
-from apex_ompl.problems.catalogue import CONSTRAINED, ProblemId, first_drawn, levels_of
 from apex_ompl.problems.broad_tasks import Held
+from apex_ompl.problems.catalogue import CONSTRAINED, ProblemId, first_drawn, levels_of
 from apex_ompl.problems.constrained_ends import line_is_free
 from apex_ompl.problems.constrained_held import CUP_ANGLE, LEVEL_ANGLE, SYNERGY, TraySize, carried_tray
 from apex_ompl.problems.frozen import digest
