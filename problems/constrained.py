@@ -33,7 +33,6 @@ SUITES = (*constrained_scenes.SCENES, UNSEEN)
 LEVELS = dict.fromkeys(SUITES, KINDS)
 """Suite -> its levels with constraints."""
 
-DIFFICULTIES = ("easy", "medium", "hard")  # of the scenes that cups go through
 LEAST_MOTION, MOST_MOTION = 0.5, 3.5  # of the joint that moves most from start to goal [rad]
 ANY_LINE = 7  # of so many problems one may have a straight line that is free
 MET = 0.6  # share of compositions that are put in the way
@@ -54,7 +53,7 @@ def draw(rng: np.random.Generator, suite: str, kind: str, seed: int) -> DrawnPro
     if suite == UNSEEN:
         found = _among_parts(rng, carried, kind, tuple(STRANGERS)[seed % len(STRANGERS)])
     elif kind == CUPS:
-        task = scenes.SUITES[suite](rng, DIFFICULTIES[int(rng.integers(len(DIFFICULTIES)))])
+        task = scenes.SUITES[suite](rng, str(rng.choice(scenes.LEVELS[suite])))
         ends = _cup_ends(rng, carried, _tables(task.scene, carried), task.start, task.goal)
         found = None if ends is None else _drawn(carried, task.scene, ends)
     else:

@@ -57,7 +57,7 @@ def shelf(rng: np.random.Generator, kind: str, size: TraySize) -> TrayTask:
     loaded = kind == LEVEL
     low, rows = rng.uniform(0.03, 0.2), int(rng.integers(2, 4))
     gap = rng.uniform(0.28, 0.38) if loaded else rng.uniform(0.24, 0.34)
-    depth, front = rng.uniform(0.25, 0.4), rng.uniform(0.54, 0.64)
+    depth, front = rng.uniform(0.25, 0.45), rng.uniform(0.5, 0.62)
     width = 2.0 * (size.half_length + HAND) + rng.uniform(0.15, 0.45)
     height, x = rows * gap, front + depth / 2
     scene = [box(f"board_{k}", (depth, width, BOARD), (x, 0.0, low + k * gap)) for k in range(rows + 1)]
@@ -69,7 +69,7 @@ def shelf(rng: np.random.Generator, kind: str, size: TraySize) -> TrayTask:
     ends = []
     for row in rng.permutation(rows)[:2]:
         z = low + row * gap + (rng.uniform(0.08, 0.11) if loaded else rng.uniform(0.1, gap - 0.1))
-        point = (front + rng.uniform(-0.02, 0.16), rng.uniform(-side, side), z)
+        point = (front + rng.uniform(0.0, 0.6) * depth, rng.uniform(-side, side), z)
         ends.append(pose(rng, kind, point, 0.15, SHELF_TILT))
     if rng.random() < 0.3:  # from before the shelf
         ends[0] = pose(rng, kind, (front - 0.2, rng.uniform(-0.3, 0.3), rng.uniform(0.12, 0.6)), 0.3, TILT)
