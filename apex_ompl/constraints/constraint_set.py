@@ -1,9 +1,9 @@
 """Constraints along a path as residuals, the violation of states, and projection onto the constraints.
 
-A record of :mod:`apex_ompl.scene.constraints` becomes one or more groups of rows of the kernel, each with its tolerance:
+A record of :mod:`apex_ompl.scene.constraints` becomes one or more groups of rows of the kernel, each with a tolerance:
 POSITION (coordinates of a frame's origin in another frame), AXIS (the angle between two axes) and ROTATION (the angle
-between two frames). It holds where |r| <= tolerance for each of its groups. Constraints of a user's own are evaluated in
-Python.
+between two frames). It holds where |r| <= tolerance for each of its groups. Constraints of a user's own are evaluated
+in Python.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from apex_ompl.constraints.frames import frame_of
@@ -19,6 +20,7 @@ from apex_ompl.constraints.links import Links
 from apex_ompl.constraints.user import UserConstraint, check_user_constraint
 from apex_ompl.errors import ConstraintError
 from apex_ompl.kernel.constraints import AXIS, POSITION, ROTATION, ConstraintGroup, ConstraintRows, JointFrame
+from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
 from apex_ompl.scene.constraints import (
@@ -27,7 +29,6 @@ from apex_ompl.scene.constraints import (
     FixedOrientation,
     OnLine,
     OnPlane,
-    Pose,
     RelativePose,
     ToolRegion,
     Upright,
@@ -41,6 +42,7 @@ HALF_SPACE = 10.0  # half the width that stands for that of a region with one bo
 EXACT = 1e-3  # tolerance up to which a region has no dead zone [m]
 ROUNDING = 1e-12  # in units of a tolerance
 NEWTON_STEPS, NEWTON_END = 20, 1e-9  # most steps, and the |r| to stop at, with constraints of a user's own
+DAMPING = 1e-10  # of the normal equations of these steps
 ATTEMPTS = 100  # random states from which contradictions are looked for
 AXES = ("x", "y", "z")
 
@@ -245,8 +247,7 @@ class ConstraintSet:
         return bool(ok.any()), self.fault(ends[int(np.argmin(np.where(np.isnan(relative), np.inf, relative)))])
 
     def _satisfied(self, states: Array) -> Flags:
-        satisfied: Flags = (self.violations(states) <= self.tolerances * (1.0 + ROUNDING)).all(axis=1)
-        return satisfied
+        return np.asarray((self.violations(states) <= self.tolerances * (1.0 + ROUNDING)).all(axis=1), bool)
 
     def _norms(self, states: ArrayLike) -> tuple[Array, Array]:
         """Return |r| of groups and of a user's own constraints at states, shapes (N, G) and (N, U)."""
@@ -266,17 +267,21 @@ class ConstraintSet:
         lower, upper = self.robot.limits.lower, self.robot.limits.upper
         q, free = np.clip(q, lower, upper), np.ones(len(q), bool)
         for step in range(NEWTON_STEPS + 1):
-            r, jacobian = self._residual(q)
+            r, jacobian = self.residual(q)
             if length(r) <= NEWTON_END:
                 return q, True
             if step == NEWTON_STEPS or not np.isfinite(r).all() or not np.isfinite(jacobian).all():
                 break
-            moved = q - np.linalg.lstsq(jacobian * free, r)[0]
+            j = jacobian * free
+            factor = cholesky(product(j, j.T) + DAMPING * np.eye(len(r)))
+            if not np.isfinite(factor).all():
+                break
+            moved = q - product(j.T, solve(factor, r[:, None]))[:, 0]
             q = np.clip(moved, lower, upper)
-            free = (q == moved) | ~free
+            free = q == moved
         return q, self.is_satisfied(q)
 
-    def _residual(self, q: Array) -> tuple[Array, Array]:
+    def residual(self, q: Array) -> tuple[Array, Array]:
         """Return the rows outside of dead zones, shape (m,), and their Jacobian, shape (m, dof)."""
         rows = [] if self.rows is None else [self.rows.residual(q, 1.0)]
         for one in self.user:
@@ -287,16 +292,15 @@ class ConstraintSet:
 
 
 class _Placed(NamedTuple):
-    """A frame: its name, joint, pose in the joint's frame and pose in the world at the start, shapes (4, 4)."""
+    """A frame: its joint, its pose in the joint's frame, and in the world at the start [m]."""
 
-    name: str
     joint: int
-    pose: Array
-    start: Array
+    pose: pin.SE3
+    start: pin.SE3
 
     def turned(self, turn: Array) -> JointFrame:
         """Return the frame with its axes turned by a rotation in its own frame, shape (3, 3)."""
-        return JointFrame(self.joint, self.pose[:3, :3] @ turn, self.pose[:3, 3])
+        return JointFrame(self.joint, product(self.pose.rotation, turn), self.pose.translation.copy())
 
 
 class _Tables:
@@ -333,7 +337,11 @@ class _Tables:
 
     def _relative_pose(self, c: RelativePose) -> Member:
         first, second = self._frame(c.first, or_world=True), self._frame(c.second)
-        pose = np.linalg.inv(first.start) @ second.start if c.pose is None else _matrix(c.pose)
+        pose = (
+            first.start.actInv(second.start)
+            if c.pose is None
+            else pin.SE3(pose_matrix(c.pose.position, c.pose.orientation))
+        )
         parts = []
         kept = [k for k in range(3) if AXES[k] not in c.free]
         if kept:
@@ -341,29 +349,29 @@ class _Tables:
             order = next(shift for shift in ([0, 1, 2], [1, 2, 0], [2, 0, 1]) if sorted(shift[: len(kept)]) == kept)
             frames = first.turned(np.eye(3)[:, order]), second.turned(np.eye(3))
             group = ConstraintGroup(
-                POSITION, len(kept), *frames, tolerance=c.tolerance.position, value=pose[:3, 3][order]
+                POSITION, len(kept), *frames, tolerance=c.tolerance.position, value=pose.translation[order]
             )
             parts.append(Part(group, "distance"))
         turns = [k for k in range(3) if f"r{AXES[k]}" in c.free]
         if not turns:
-            frames = first.turned(pose[:3, :3]), second.turned(np.eye(3))
+            frames = first.turned(pose.rotation), second.turned(np.eye(3))
             parts.append(Part(ConstraintGroup(ROTATION, 3, *frames, tolerance=c.tolerance.angle), "angle"))
         elif len(turns) == 1:
             axis = _with_last(np.eye(3)[turns[0]])
-            frames = first.turned(pose[:3, :3] @ axis), second.turned(axis)
+            frames = first.turned(product(pose.rotation, axis)), second.turned(axis)
             parts.append(Part(ConstraintGroup(AXIS, 2, *frames, tolerance=c.tolerance.angle), "angle"))
         return self._checked(f"pose of {c.second} in {c.first}", parts)
 
     def _on_axes(self, what: str, c: OnPlane | OnLine, turn: Array, rows: int) -> Member:
         """Return a constraint to a point along the first ``rows`` axes of ``turn``."""
         frame = self._frame(c.frame)
-        point = frame.start[:3, 3] if c.point is None else np.array(c.point)
+        point = frame.start.translation if c.point is None else np.array(c.point)
         group = ConstraintGroup(POSITION, rows, _in_world(turn, point), frame.turned(np.eye(3)), tolerance=c.tolerance)
         return self._checked(f"{what} of {c.frame}", [Part(group, "distance")])
 
     def _fixed_orientation(self, c: FixedOrientation) -> Member:
         frame = self._frame(c.frame)
-        wanted = frame.start[:3, :3] if c.orientation is None else _rotation(c.orientation)
+        wanted = frame.start.rotation if c.orientation is None else _rotation(c.orientation)
         group = ConstraintGroup(ROTATION, 3, _in_world(wanted), frame.turned(np.eye(3)), tolerance=c.angle)
         return self._checked(f"orientation of {c.frame}", [Part(group, "angle")])
 
@@ -390,10 +398,10 @@ class _Tables:
 
     def _frame(self, name: str, or_world: bool = False) -> _Placed:
         if or_world and name == WORLD:
-            return _Placed(name, 0, np.eye(4), np.eye(4))
+            return _Placed(0, pin.SE3.Identity(), pin.SE3.Identity())
         frame = frame_of(self.robot, name, self.held, "frame of a constraint")
-        joint, pose = self.links.frame(frame.link, frame.pose)
-        return _Placed(name, joint, pose, self.robot.link_pose(self.start, frame.link) @ frame.pose)
+        joint, pose = self.links.frame(frame.link, pin.SE3(frame.pose))
+        return _Placed(joint, pose, pin.SE3(self.robot.link_pose(self.start, frame.link)) * pin.SE3(frame.pose))
 
     def _checked(self, name: str, parts: Sequence[Part]) -> Member:
         for part in parts:
@@ -415,10 +423,6 @@ def _told_apart(names: Sequence[str]) -> tuple[str, ...]:
 
 def _in_world(rotation: Array, point: Array | None = None) -> JointFrame:
     return JointFrame(0, rotation, np.zeros(3) if point is None else point)
-
-
-def _matrix(pose: Pose) -> Array:
-    return pose_matrix(pose.position, pose.orientation)
 
 
 def _rotation(orientation: Sequence[float]) -> Array:

@@ -48,6 +48,7 @@ class PlanningSetup:
             in the workspace that was not reached, why.
         alignment: The alignment goal, or None.
         held: Numbers of the joints that stay as at the start.
+        constraints: Constraints along the path, or None where there are none.
         seed: Seed of the sampling of goals, and of the plan.
         notes: Sentences on joints of the start and the goals that were moved to their limits, and on meshes that are no
             proper solids, and how they are interpreted.
@@ -66,6 +67,7 @@ class PlanningSetup:
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
     held: NDArray[np.intp]
+    constraints: ConstraintSet | None
     seed: int
     notes: tuple[str, ...]
 

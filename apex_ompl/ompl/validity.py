@@ -15,6 +15,7 @@ from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.path_proof import Curve, PathProof
+from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.ompl.simple_setup import SpaceInformation
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.timing.trajectory import ROUNDING, Trajectory
@@ -55,17 +56,20 @@ class StateValidityChecker(ob.StateValidityChecker):
     kept in ``fault``, without OMPL's states (see ``forget_states``).
     """
 
-    def __init__(self, si: ob.SpaceInformation, checker: CollisionChecker) -> None:
-        """Check states of ``si`` by ``checker``."""
+    def __init__(
+        self, si: ob.SpaceInformation, checker: CollisionChecker, constraints: ConstraintSet | None = None
+    ) -> None:
+        """Check states of ``si`` by ``checker``, and whether they satisfy constraints."""
         super().__init__(si)
-        self.checker = checker
+        self.checker, self.constraints = checker, constraints
         self.dof = checker.robot.dof
         self.fault: BaseException | None = None
 
     def isValid(self, state: Any) -> bool:  # noqa: N802 - OMPL's name
         """Whether the state is free."""
         try:
-            return self.checker.is_free(np.array(state[0 : self.dof]))
+            q = np.array(state[0 : self.dof])
+            return (self.constraints is None or self.constraints.is_satisfied(q)) and self.checker.is_free(q)
         except BaseException as error:
             state = None
             self.fault = self.fault or error
