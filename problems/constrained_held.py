@@ -78,7 +78,7 @@ class Carried:
 def draw_carried(rng: np.random.Generator, kind: str) -> Carried:
     """Draw what is carried on a level of constrained problems: a tray of some size, or the cups."""
     if kind == CUPS:
-        return _cups()
+        return held_cups()
     half_length, depth, pitch = (float(rng.choice(some)) for some in (HALF_LENGTHS, DEPTHS, PITCHES))
     return carried_tray(TraySize(half_length, depth, pitch), loaded=kind == LEVEL)
 
@@ -102,7 +102,7 @@ def carried_tray(size: TraySize, *, loaded: bool) -> Carried:
 
 
 @cache
-def _cups() -> Carried:
+def held_cups() -> Carried:
     """Return a cup for each hand; their openings are on the side of the thumbs."""
     objects = [("left_hand", cup("left_cup", 1)), ("right_hand", cup("right_cup", -1))]
     attached, home, _ = close_hands(robot(), objects)
