@@ -187,7 +187,7 @@ SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecifi
     CarrySpecification("problems/data/carry_tray.yaml", counter, ((0.5, 0.42, 0.28),), ((0.5, -0.42, 0.28),)),
     CarrySpecification(
         "problems/data/pour_upright.yaml", wall_between(0.4),
-        ((0.52, 0.4, 0.2), (0.52, -0.4, 0.2)), ((0.52, 0.07, 0.52), (0.52, -0.07, 0.7)),
-        ((0.0, 0.0), (-0.5, 0.5)),
+        ((0.48, 0.3, 0.25), (0.48, -0.3, 0.25)), ((0.52, 0.07, 0.52), (0.52, -0.07, 0.7)),
+        ((0.4, -0.4), (-0.5, 0.5)),
     ),
 )  # fmt: skip
