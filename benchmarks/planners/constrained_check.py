@@ -1,7 +1,7 @@
 """What the rivals under constraints share: the check of their paths.
 
-The check is independent of the kernel: constraints are evaluated by Pinocchio from the record of the problem, and
-collisions by the meshes, at states twenty times as dense as those of the search. A rival's path is refined before it,
+The check evaluates constraints by Pinocchio from the record of the problem, independent of the kernel, and looks for
+collisions, at states twenty times as dense as those of the search. A rival's path is refined before it,
 in its favor: states between its own are moved to the constraint. Its times do not include refinement and check.
 """
 
@@ -22,7 +22,7 @@ from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length, states_between
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import pose_matrix
-from apex_ompl.scene.constraints import FixedOrientation, OnLine, OnPlane, RelativePose, Upright
+from apex_ompl.scene.constraints import WORLD, FixedOrientation, OnLine, OnPlane, RelativePose, Upright
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
@@ -73,7 +73,7 @@ class FrameReader:
                 self._frames[name] = (self.robot.link_frame(frame.link), frame.pose)
             number, pose = self._frames[name]
             found[name] = self._data.oMf[number].homogeneous @ pose
-        found["world"] = np.eye(4)
+        found[WORLD] = np.eye(4)
         return found
 
 
@@ -89,8 +89,14 @@ def _unit(vector: Any) -> Array:
     return np.asarray(vector, float) / np.linalg.norm(vector)
 
 
-def residual_of(constraint: Any, start: Mapping[str, Array]) -> tuple[tuple[str, ...], Residual]:
-    """Return the frames of a constraint, and its violation over its tolerance as a function of their poses.
+def frames_of(constraint: Any) -> tuple[str, ...]:
+    """Return the names of the frames of a constraint but for the world."""
+    names = (constraint.first, constraint.second) if isinstance(constraint, RelativePose) else (constraint.frame,)
+    return tuple(name for name in names if name != WORLD)
+
+
+def residual_of(constraint: Any, start: Mapping[str, Array]) -> Residual:
+    """Return the violation of a constraint over its tolerance as a function of the poses of its frames.
 
     Args:
         constraint: A record of :mod:`apex_ompl.scene.constraints`; turns of a relative pose are all free or none.
@@ -101,9 +107,9 @@ def residual_of(constraint: Any, start: Mapping[str, Array]) -> tuple[tuple[str,
     """
     if isinstance(constraint, Upright):
         axis, up = _unit(constraint.axis), _unit(constraint.up)
-        return (constraint.frame,), lambda p: _angle(p[constraint.frame][:3, :3] @ axis, up) / constraint.angle
+        return lambda p: _angle(p[constraint.frame][:3, :3] @ axis, up) / constraint.angle
     if isinstance(constraint, RelativePose):
-        return (constraint.first, constraint.second), _relative(constraint, start)
+        return _relative(constraint, start)
     if isinstance(constraint, OnPlane | OnLine):
         name = constraint.frame
         origin = start[name][:3, 3].copy() if constraint.point is None else np.array(constraint.point)
@@ -114,12 +120,12 @@ def residual_of(constraint: Any, start: Mapping[str, Array]) -> tuple[tuple[str,
             off = along @ offset if isinstance(constraint, OnPlane) else np.linalg.norm(np.cross(along, offset))
             return float(abs(off)) / constraint.tolerance
 
-        return (name,), distance
+        return distance
     if isinstance(constraint, FixedOrientation):
         wanted = start[constraint.frame].copy()
         if constraint.orientation is not None:
             wanted = pose_matrix((0.0, 0.0, 0.0), constraint.orientation)
-        return (constraint.frame,), lambda p: _turned(wanted, p[constraint.frame]) / constraint.angle
+        return lambda p: _turned(wanted, p[constraint.frame]) / constraint.angle
     raise NotImplementedError(f"no dense check of {type(constraint).__name__}")
 
 
@@ -171,15 +177,15 @@ def dense_check(robot: Robot, problem: Problem, path: Array, spacing: float = DE
     """
     stretches = (np.concatenate([states_between(a, b, spacing), b[None]]) for a, b in pairwise(path))
     states = np.concatenate([path[:1], *stretches])
-    reader = FrameReader(robot, problem)
-    start = problem.start_state(robot.joint_names)
+    reader, constraints = FrameReader(robot, problem), all_constraints(problem)
+    names = tuple(dict.fromkeys(name for one in constraints for name in frames_of(one)))
+    at_start = reader(problem.start_state(robot.joint_names), names)
+    residuals = [residual_of(one, at_start) for one in constraints]
     worst = 0.0
-    for constraint in all_constraints(problem):
-        frames = (constraint.first, constraint.second) if isinstance(constraint, RelativePose) else (constraint.frame,)
-        named = tuple(name for name in frames if name != "world")
-        _, residual = residual_of(constraint, reader(start, named))
-        worst = max(worst, *(residual(reader(q, named)) for q in states))
-    checker = CollisionChecker(robot, problem.scene, problem.attached, proofs=False)
+    for q in states:
+        poses = reader(q, names)
+        worst = max(worst, *(residual(poses) for residual in residuals))
+    checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
     return DenseCheck(len(states), worst, bool(checker.are_free(states).all()))
 
 

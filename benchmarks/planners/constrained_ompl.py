@@ -87,7 +87,7 @@ class Rows(ob.Constraint):
         self.slacks = [0.0 if equations else group.slack for group in rows.groups]
         count = sum(1 if slack else last - first for slack, (first, last) in zip(self.slacks, self.spans, strict=True))
         super().__init__(len(joints), count, tolerance)
-        self.rows, self.constraints, self.joints = rows, constraints, joints
+        self.rows, self.joints, self.end = rows, joints, 0.5 * tolerance
         self._q = np.array(start, float)
 
     def state(self, x: Array) -> Array:
@@ -127,7 +127,7 @@ class ProjectedRows(Rows):
 
     def project(self, x: Array) -> bool:
         """Move joints ``x`` onto the constraint in place, and return whether they arrived."""
-        moved, arrived = self.constraints.project(self.state(x)[None])
+        moved, arrived = self.rows.project(self.state(x), self.end)
         x[:] = moved[0, self.joints]
         return bool(arrived[0])
 
@@ -190,12 +190,11 @@ def plan_with_ompl(job: Job) -> Run:
         planner.setRange(settings.range if settings.range is not None else space.getRho_s())
     simple.setPlanner(planner)
     simple.setup()
-    return _solved(job, settings, ready, constraints, simple, joints)
+    return _solved(job, settings.simplify, ready, constraints, simple)
 
 
 def _solved(
-    job: Job, settings: Settings, ready: PlanningSetup, constraints: ConstraintSet, simple: og.SimpleSetup,
-    joints: Array,
+    job: Job, share: float, ready: PlanningSetup, constraints: ConstraintSet, simple: og.SimpleSetup
 ) -> Run:  # fmt: skip
     times: dict[str, float] = {}
     until = time.perf_counter() + job.timeout
@@ -203,17 +202,18 @@ def _solved(
         status = simple.solve(ob.PlannerTerminationCondition(lambda: time.perf_counter() > until)).getStatus()
     if status != ob.PlannerStatus.PlannerStatusType.EXACT_SOLUTION:
         return columns(ready, constraints, (), times, str(status.name))
-    paths = [_states(ready, simple, joints)]
-    left = min(until - time.perf_counter(), settings.simplify * job.timeout)
+    paths = [_states(ready, simple)]
+    left = min(until - time.perf_counter(), share * job.timeout)
     if left > 0.0:
         with timed(times, "simplify"):
             simple.simplifySolution(left)
-        paths.insert(0, _states(ready, simple, joints))
+        paths.insert(0, _states(ready, simple))
     return columns(ready, constraints, paths, times)
 
 
-def _states(ready: PlanningSetup, simple: og.SimpleSetup, joints: Array) -> Array:
+def _states(ready: PlanningSetup, simple: og.SimpleSetup) -> Array:
     """Return the states of the path that was found, on the manifold ``delta`` apart, with exact ends."""
+    joints = arm_joints(ready)
     path = og.PathGeometric(simple.getSolutionPath())
     path.interpolate()
     rows: Sequence[Sequence[float]] = [[one[k] for k in range(len(joints))] for one in path.getStates()]

@@ -1,8 +1,9 @@
 """RoboPlan's constrained RRT-Connect (CBiRRT2 by projection) on problems with constraints.
 
-Its scene is that of :mod:`benchmarks.planners.peers`: the same bodies and pairs, checked by itself. Frames of constraints
-are links that are added to the URDF. A closed chain is the pose of one hand's frame in the other's, and an upright axis
-a box of roll and pitch inside of its cone. Its shortcuts know no constraints, so that its paths are left as they are.
+Its scene is that of :mod:`benchmarks.planners.peers`: the same bodies and pairs, checked by itself. Frames of
+constraints are links that are added to the URDF. A closed chain is the pose of one hand's frame in the other's, and an
+upright axis a box of roll and pitch inside of its cone. Its shortcuts know no constraints, so that its paths are left
+as they are.
 """
 
 from __future__ import annotations
