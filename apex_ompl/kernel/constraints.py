@@ -340,7 +340,7 @@ class ConstraintProof:
         piece: Piece between states ``piece`` and ``piece + 1`` at which the proof failed, or -1.
         share: Place on that piece, from 0 to 1.
         group: Group that failed there; -1 where it did not, or where the piece has no numbers.
-        value: Its |r| there where that is above the tolerance; else the bound that stays above it.
+        value: Its |r| there; where that is within the tolerance, it is so near to it that bisection did not end.
     """
 
     proved: bool

@@ -492,8 +492,9 @@ def _orientation_constraint(
 ) -> Iterator[Constraint]:
     """Yield a constraint of the orientation, or of one axis where turns about it are free.
 
-    MoveIt bounds the angles about x, y and z of the rotation from the wanted orientation, as Euler angles or as parts of
-    the rotation vector. Up to a right angle none of them is larger than the angle of the rotation, which is bounded here.
+    MoveIt bounds the angles about x, y and z of the rotation from the wanted orientation, as Euler angles or as parts
+    of the rotation vector. Up to a right angle none of them is larger than the angle of the rotation, which is bounded
+    here.
     """
     link, base = reader.constrained_link(message, start, where)
     base = base @ reader.pose({"orientation": message.get("orientation")}, where)

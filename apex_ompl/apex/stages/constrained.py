@@ -57,7 +57,15 @@ class ConstrainedTrees:
     iterations: int
 
     def run(self, context: SolveContext) -> Solution | None:
-        """Return the path of the trees, cut short, or None where they do not meet, or it is not valid."""
+        """Return the path of the trees, or None where they do not meet, or it is not valid."""
+        found = self.search(context)
+        if found is None:
+            return None
+        context.tree_nodes, states = found
+        return Solution(Path(states), TREES)
+
+    def search(self, context: SolveContext) -> tuple[Array, Array] | None:
+        """Return nodes and states of a valid path, or None where there is none."""
         paths = on_constraints(context)
         with context.report.timed("rrtconnect"):
             trees = context.constrained_trees or paths.trees(
@@ -72,10 +80,7 @@ class ConstrainedTrees:
         context.constrained_trees = None  # they have met: others are to find another path
         with context.report.timed("check"):
             states = paths.along(nodes)
-        if states is None:
-            return None
-        context.tree_nodes = nodes
-        return Solution(Path(states), TREES)
+        return None if states is None else (nodes, states)
 
 
 @dataclass(frozen=True)
@@ -172,17 +177,19 @@ class ConstrainedShorten:
             yield paths.fit(context.best.states)
         pair = context.best.states[[0, -1]]
         yield context.optimizer.spline.line(*pair)
-        for turn in count() if self.again else range(1):
-            if not self.again and context.best.length <= DETOUR * path_length(pair):
-                return
-            proposed = context.sampler.propose(context.queries, max(self.count, 1)) if self.count else None
-            yield from () if proposed is None else proposed
-            if self.again:
-                trees = ConstrainedTrees(ITERATIONS).run(context)
-                nodes, context.tree_nodes = context.tree_nodes, None
-                if trees is not None and nodes is not None:
-                    yield paths.fit(self._shortcut(context, paths, nodes))
-            del turn
+        if context.best.length > DETOUR * path_length(pair):
+            yield from self._proposals(context)
+        while self.again:
+            found = ConstrainedTrees(ITERATIONS).search(context)
+            if found is not None:
+                yield paths.fit(self._shortcut(context, paths, found[0]))
+            yield from self._proposals(context)
+
+    def _proposals(self, context: SolveContext) -> Array:
+        """Return control points of proposals, shape (B, points, dof)."""
+        proposed = context.sampler.propose(context.queries, self.count) if self.count else None
+        spline, dof = context.optimizer.spline, context.kernel.robot.dof
+        return np.empty((0, spline.points, dof)) if proposed is None else proposed
 
     @staticmethod
     def _shortcut(context: SolveContext, paths: ConstrainedPaths, nodes: Array) -> Array:

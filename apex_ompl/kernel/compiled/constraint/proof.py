@@ -6,8 +6,8 @@ with x = m + u h and |u| <= 1, its states are
     q = q_m + delta,   delta = u s + u^2 b + u^3 c + e,   |e_i| <= d_i,
 
 s, b and c the derivatives of Taylor's theorem, d rounding and gaps between pieces, so that |delta_i| <= w_i =
-|s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A. Let
-y be the place of B, its z axis, or twice the vector part of its quaternion, each seen from A. On all of this box, for
+|s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A.
+Let y be the place of B, its z axis, or twice the vector part of its quaternion, each seen from A. On this box, for
 
     far_i = |a_i x (p - o_i)| at q_m,   arm_i = far_i + m_i,   m_i = sum of w_k arm_k over k > i,
 
@@ -17,8 +17,8 @@ places and 0 for axes), the distance of p from the axis of joint i is at most ar
     |y(q) - y_m - J delta| <= 1/2 sum_i w_i arm_i (w_i + 2 sum_k w_k),
 
 the inner sum over revolute joints k < i, the first term for revolute joints i alone. For the quaternion the sum is
-sum_i (v w_i^2 / 2 + w_i sum_{k < i} w_k), v >= |vector part| on the box. J delta is u J s + u^2 J b + u^3 J c + J e, and
-a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were independent. So |y| is at most
+sum_i (v w_i^2 / 2 + w_i sum_{k < i} w_k), v >= |vector part| on the box. J delta is u J s + u^2 J b + u^3 J c + J e,
+and a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were independent. So |y| is at most
 
     max |y_m +- J s + {0, 1} J b| + |J c| + sum_i d_i far_i + half the sum above,
 
@@ -62,7 +62,7 @@ class ConstraintProofBuffers(NamedTuple):
 
     Attributes:
         counts: Intervals examined, and piece and group at which the proof failed, -1 for none.
-        figures: Share of the piece, and |r| or the bound at which it failed.
+        figures: Share of the piece at which it failed, and |r| there.
         bounds: Largest proved bounds of the groups [m, rad].
         violations: Largest |r| of the groups at examined states [m, rad].
         found: Bounds of the groups on an interval.
@@ -297,7 +297,7 @@ def _set_interval(middle: float, half: float, p: ConstraintProofBuffers) -> None
 def _examine(
     t: RobotArrays, w: Workspace, c: ConstraintArrays, p: ConstraintProofBuffers, b: RowBuffers
 ) -> tuple[int, int, float]:
-    """Examine the interval that is set: outcome, group and figure; UNDECIDED where it is to be bisected."""
+    """Return outcome, failing group and its |r| for the interval that is set; UNDECIDED where it is to be bisected."""
     place_joints(t, w, p.state, c.chain, 0, len(c.chain))
     for g in range(len(c.kind)):
         size, bound = bound_group(t, w, c, g, p, b)
@@ -305,7 +305,7 @@ def _examine(
         if not size <= c.tolerance[g]:
             return VIOLATED, g, size
         if not bound <= c.tolerance[g]:
-            return UNDECIDED, g, bound
+            return UNDECIDED, g, size
         p.found[g] = bound
     for g in range(len(c.kind)):
         p.bounds[g] = max(p.bounds[g], p.found[g])
@@ -363,12 +363,12 @@ def prove_constraints(
             middle = 0.5 * (start + end)
             _set_interval(middle, 0.5 * (end - start), p)
             p.counts[0] += 1
-            outcome, g, figure = _examine(t, w, c, p, b)
+            outcome, g, size = _examine(t, w, c, p, b)
             if outcome == PROVED:
                 continue
             last = top + 2 > len(p.stack) or p.counts[0] >= most
             if outcome == VIOLATED or last or not p.violations[g] + ROUNDING <= c.tolerance[g]:
-                p.counts[1], p.counts[2], p.figures[0], p.figures[1] = k, g, middle, figure
+                p.counts[1], p.counts[2], p.figures[0], p.figures[1] = k, g, middle, size
                 return outcome
             p.stack[top, 0], p.stack[top, 1] = middle, end
             p.stack[top + 1, 0], p.stack[top + 1, 1] = start, middle
