@@ -109,10 +109,8 @@ class ToolPath:
         Raises:
             ParameterError: The radius is larger than half a segment, or all poses are the same.
         """
-        moves = np.stack([_moves(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)])
-        lengths, turns = _norms(moves[..., :3]), _norms(moves[..., 3:])
-        size = np.maximum(lengths, TURN * turns).max(axis=1)
-        kept = np.flatnonzero(size > max(SAME_POINT, TURN * SAME_TURN))
+        moves, lengths, size = _segments(poses)
+        kept = np.flatnonzero(size > SAME_POINT)
         if not len(kept):
             raise ParameterError("pose", "the pose at the start", "poses that differ from it")
         for k in kept.tolist() if blend and len(kept) > 1 else ():
@@ -190,6 +188,11 @@ class ToolPath:
         return np.clip(np.searchsorted(self.ends, u, side="right") - 1, 0, len(self.pieces) - 1)
 
 
+def are_same(poses: Array) -> bool:
+    """Whether poses of F frames, shape (K, F, 4, 4), count as one."""
+    return not (_segments(poses)[2] > SAME_POINT).any()
+
+
 def turns(vector: Array, shares: Array) -> Array:
     """Return the rotations exp(a w) for a rotation vector w, shape (3,), and shares a, shape (N,); shape (N, 3, 3)."""
     angle = float(_norms(vector))
@@ -207,6 +210,17 @@ def turns(vector: Array, shares: Array) -> Array:
 def _norms(vectors: Array) -> Array:
     """Return the lengths of vectors along the last axis."""
     return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1)))
+
+
+def _segments(poses: Array) -> tuple[Array, Array, Array]:
+    """Return the segments between poses of F frames, shape (K + 1, F, 4, 4).
+
+    Returns:
+        Translations and rotation vectors, shape (K, F, 6), lengths, shape (K, F) [m], and differences of u, shape (K,).
+    """
+    moves = np.stack([_moves(a, b) for a, b in zip(poses[:-1], poses[1:], strict=True)])
+    lengths = _norms(moves[..., :3])
+    return moves, lengths, np.maximum(lengths, TURN * _norms(moves[..., 3:])).max(axis=1)
 
 
 def _moves(first: Array, second: Array) -> Array:

@@ -72,9 +72,7 @@ def _beyond(tracker: LineTracker, u: Array) -> DeadEnd:
     robot, rng = tracker.checker.robot, np.random.default_rng(0)
     seeds = robot.random_state(rng, SEEDS)
     rotation, point = tracker.path.poses(u)
-    found, ok = tracker.tools.close(
-        seeds, np.repeat(rotation, SEEDS, axis=0), np.repeat(point, SEEDS, axis=0), STEPS
-    )
+    found, ok = tracker.tools.close(seeds, np.repeat(rotation, SEEDS, axis=0), np.repeat(point, SEEDS, axis=0), STEPS)
     inside = ((found >= robot.limits.lower) & (found <= robot.limits.upper))[:, tracker.moving].all(axis=1)
     if (ok & inside).any():
         return DeadEnd(LineEnd.SINGULARITY, (), "the arm is singular, and goes on in another branch only")

@@ -1,7 +1,7 @@
 """Proof that tools stay near a path of poses (:mod:`apex_ompl.constraints.line`) along states and motions.
 
-Samples are at times t_i, with parameters s_i at which the path is nearest. In between, the parameter s(t) is taken to be
-linear in time. With e(t) = p(t) - p_path(s(t)), and E(t) = R_path(s(t))^T R(t),
+Samples are at times t_i, with parameters s_i at which the path is nearest. In between, the parameter s(t) is taken to
+be linear in time. With e(t) = p(t) - p_path(s(t)), and E(t) = R_path(s(t))^T R(t),
 
     |e| <= max(|e_i|, |e_i+1|) + h^2 / 8 max |e''|,    h = t_i+1 - t_i,
 
@@ -17,6 +17,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.constraints.line import TURN, ToolPath
 from apex_ompl.constraints.tools import Tools, pose_errors
@@ -26,7 +27,8 @@ from apex_ompl.types import Array
 REMAINDER = 5e-6, 1e-4  # largest h^2 / 8 max |e''|, and of the angle, that samples are chosen for [m, rad]
 WEIGHTS = 1e4, 600.0  # of lengths and angles in the search for the nearest pose [1/m, 1/rad]
 SEARCH_STEPS = 3
-MOST_SAMPLES = 200_000
+MOST_PARTS = 10_000
+ROUNDING = 1e-9  # [m, rad]
 
 
 class Deviation(NamedTuple):
@@ -57,7 +59,7 @@ class Samples(NamedTuple):
     acceleration: Array
 
 
-def path_deviation(tools: Tools, path: ToolPath, u: Array, states: Array, parts: int = 4) -> Deviation:
+def path_deviation(tools: Tools, path: ToolPath, u: Array, states: Array) -> Deviation:
     """Return bounds for straight lines between states, shape (N, dof), which belong to parameters, shape (N,).
 
     Args:
@@ -65,16 +67,14 @@ def path_deviation(tools: Tools, path: ToolPath, u: Array, states: Array, parts:
         path: Their path.
         u: Parameters, increasing.
         states: The states.
-        parts: Parts that each straight line is divided into.
     """
-    shares = np.linspace(0.0, 1.0, parts + 1)[:-1]
     steps = np.diff(states, axis=0)
-    fine = (states[:-1, None] + shares[:, None] * steps[:, None]).reshape(-1, states.shape[1])
-    guess = (u[:-1, None] + shares * np.diff(u)[:, None]).ravel()
-    speed = np.repeat(np.abs(steps), parts, axis=0)
-    samples = Samples(
-        np.append(fine, states[-1:], axis=0), np.full(len(fine), 1.0 / parts), speed, np.zeros_like(speed)
-    )
+    speed, still = np.abs(steps), np.zeros_like(steps)
+    parts = _parts(tools, np.ones(len(steps)), speed, still)
+    share, which = _shares(parts), np.repeat(np.arange(len(steps)), parts)
+    fine = states[which] + share[:, None] * steps[which]
+    guess = u[which] + share * np.diff(u)[which]
+    samples = Samples(np.append(fine, states[-1:], axis=0), 1.0 / parts[which], speed[which], still[which])
     return _deviation(tools, path, samples, np.append(guess, u[-1]))
 
 
@@ -94,15 +94,9 @@ def motion_deviation(
     spans = np.diff(times)
     a = np.maximum(np.abs(acceleration[:-1]), np.abs(acceleration[1:]))
     v = np.maximum(np.abs(velocity[:-1]), np.abs(velocity[1:])) + 0.5 * spans[:, None] * a
-    needed = np.zeros(len(spans))
-    for f in range(len(tools.tools)):
-        bend, turn, turning = tools.bends(f, v, a)
-        needed = np.maximum(needed, bend / (8.0 * REMAINDER[0]))
-        needed = np.maximum(needed, (4.0 * turn * turn + 2.0 * turning) / (8.0 * REMAINDER[1]))
-    parts = np.clip(np.ceil(spans * np.sqrt(needed)), 1.0, MOST_SAMPLES).astype(int)
+    parts = _parts(tools, spans, v, a)
     steps = np.repeat(spans / parts, parts)
-    share = np.concatenate([np.arange(n) / n for n in parts.tolist()])
-    fine = np.append(np.repeat(times[:-1], parts) + share * np.repeat(spans, parts), times[-1])
+    fine = np.append(np.repeat(times[:-1], parts) + _shares(parts) * np.repeat(spans, parts), times[-1])
     q = sample_motion(knots, fine, count=1)[0]
     samples = Samples(q, steps, np.repeat(v, parts, axis=0), np.repeat(a, parts, axis=0))
     gone, arc = _arcs(q), _arcs(states)
@@ -131,13 +125,17 @@ def _deviation(tools: Tools, path: ToolPath, samples: Samples, guess: Array) -> 
         norm -= math.sqrt(2.0) / TURN * free[:, f]
         most = float(norm.max(initial=0.0)) / (2.0 * math.sqrt(2.0))
         angle = max(angle, 2.0 * math.asin(min(most, 1.0)))
-    return Deviation(position, angle)
+    return Deviation(position + ROUNDING, angle + ROUNDING)
 
 
 def _nearest(path: ToolPath, rotation: Array, point: Array, guess: Array) -> Array:
-    """Return the parameters of the nearest poses, by Gauss-Newton steps inside the range of a guess, shape (N,)."""
-    low, high = float(guess.min()), float(guess.max())
-    u = guess
+    """Return the parameters of the nearest poses, by Gauss-Newton steps from a guess, shape (N,).
+
+    They stay between the stops of the path, where it has corners, and where the guess is a stop.
+    """
+    stops, u = np.array(path.stops), guess
+    low = stops[np.searchsorted(stops, guess, side="right") - 1]
+    high = stops[np.minimum(np.searchsorted(stops, guess, side="left"), len(stops) - 1)]
     weights = np.repeat(WEIGHTS, 3) ** 2
     for _ in range(SEARCH_STEPS):
         error = pose_errors(rotation, point, *path.poses(u))
@@ -145,6 +143,29 @@ def _nearest(path: ToolPath, rotation: Array, point: Array, guess: Array) -> Arr
         along = (weights * error * slope).sum(axis=(1, 2)) / (weights * slope * slope).sum(axis=(1, 2))
         u = np.clip(u - along, low, high)
     return u
+
+
+def _parts(tools: Tools, spans: Array, velocity: Array, acceleration: Array) -> NDArray[np.intp]:
+    """Return into how many parts stretches are divided, shape (N,), so that remainders are small.
+
+    Args:
+        tools: The tools.
+        spans: Times of the stretches, shape (N,) [s].
+        velocity: Bounds of |q'|, shape (N, dof).
+        acceleration: Bounds of |q''|, shape (N, dof).
+    """
+    needed = np.zeros(len(spans))
+    for f in range(len(tools.tools)):
+        bend, turn, turning = tools.bends(f, velocity, acceleration)
+        needed = np.maximum(needed, bend / (8.0 * REMAINDER[0]))
+        needed = np.maximum(needed, (4.0 * turn * turn + 2.0 * turning) / (8.0 * REMAINDER[1]))
+    return np.clip(np.ceil(spans * np.sqrt(needed)), 1.0, MOST_PARTS).astype(np.intp)
+
+
+def _shares(parts: NDArray[np.intp]) -> Array:
+    """Return 0, 1/n, ..., (n - 1)/n for each number of parts n, one after the other."""
+    first = np.cumsum(parts) - parts
+    return np.asarray((np.arange(int(parts.sum())) - np.repeat(first, parts)) / np.repeat(parts, parts))
 
 
 def _arcs(states: Array) -> Array:

@@ -37,14 +37,16 @@ CLEARANCE, LIMIT, MANIPULABILITY = 0.03, 0.1, 0.03  # margins [m, rad, -]
 WEIGHTS = 4.0, 1.0, 0.3  # of the squared shares that the margins lack
 SMOOTHNESS = 0.02  # w
 PROBE = 1e-4  # along null vectors, for the slope of the manipulability [rad]
+ROUNDS = 3  # of relaxing, choosing and going on
 RELAXATIONS = 12
 FIRST_DAMPING, LEAST_GAIN = 1e-3, 1e-3
 LARGEST_MOVE = 0.3  # along a null vector in one step of relaxation [rad]
 SELF_STEP, SELF_STEPS = 0.12, 24  # of sampled self-motions [rad]
-JUMP = 0.35  # largest step of a joint between neighbors in dynamic programming [rad]
+JUMP = 0.5  # largest step of a joint between neighbors in dynamic programming [rad]
 CHORD = 2e-5  # largest error in the middle between neighbors [m]; TURN of it of angles
 REFINEMENTS = 8
 BISECTIONS = 7
+ROOM = 5e-4  # of the end of a track that does not go on, from contact [m]
 
 
 class Track(NamedTuple):
@@ -105,24 +107,19 @@ class LineTracker:
         """
         track = self.tracked(Track(self.grid[:1], start[None]))
         best = track.upto(self.free_count(track))
-        if self._complete(best):
-            smooth = self.relaxed(track) if self._cost(track) else track
-            return smooth if self.free_count(smooth) == len(track.u) else track
-        for _ in range(3):
-            before = len(best.u)
-            track = self.tracked(track)
-            for way in (self.relaxed, self.chosen):
+        if self._complete(best) and not self._cost(best):
+            return best
+        for _ in range(ROUNDS):
+            for improved in (self.relaxed, self.chosen):
                 if self.stop() or len(track.u) < 2:
                     return best
-                track = way(track)
-                if way == self.chosen:
-                    smooth = self.relaxed(track)
-                    track = max((smooth, track), key=self.free_count)
+                track = improved(track)
                 count = self.free_count(track)
-                best = track.upto(count) if count > len(best.u) else best
+                best = track.upto(count) if count >= len(best.u) else best
                 if self._complete(best):
                     return best
-            if len(best.u) <= before or len(track.u) == len(self.grid):
+            count, track = len(track.u), self.tracked(track)
+            if len(track.u) == count:
                 break
         return best
 
@@ -164,7 +161,7 @@ class LineTracker:
                 break
             moved = q.copy()
             for f, null in enumerate(at.nulls):
-                moved += self._step(u, q, null, at.slope[f], at.bend[f], damping)[:, None] * null
+                moved += self._step(Track(u, q), at, f, damping)[:, None] * null
             moved, ok = self._closed(moved, u)
             moved[0] = q[0]
             if ok[1:].all() and self._cost_of(Track(u, moved)) < at.cost:
@@ -179,14 +176,18 @@ class LineTracker:
         return Track(u, q)
 
     def chosen(self, track: Track) -> Track:
-        """Return a track by dynamic programming over self-motions, one tool after the other; it may be shorter."""
+        """Return a track by dynamic programming over self-motions, one tool after the other; it may be shorter.
+
+        The other tools stay on their tracks, and those that are chosen later may still collide in the first round.
+        """
         count = len(self.tools.tools)
         for turn in range(count if count == 1 else count + 1):
             f, hard = turn % count, turn >= count - 1
             if self.stop():
                 break
             track = self._chosen(track, f, hard)
-        return track
+        smooth = self.relaxed(track) if len(track.u) > 1 else track
+        return max((smooth, track), key=self.free_count)
 
     def refined(self, track: Track) -> Track:
         """Return a track with more states, so that straight lines in between keep the poses; or as far as they do."""
@@ -221,14 +222,19 @@ class LineTracker:
         return count if free.all() else 1 + int(np.argmin(free))
 
     def extended(self, track: Track, to: float) -> Track:
-        """Return a track that ends at the last place before a parameter that it reaches, by bisection."""
-        u, q = track.u, track.states
+        """Return a track that ends at the last place before a parameter that it reaches, by bisection.
+
+        It ends a little away from bodies, so that a motion may end there.
+        """
+        u, q = track
+        while len(u) > 1 and self.checker.clearance(q[-1]) < ROOM:
+            u, q, to = u[:-1], q[:-1], float(u[-1])
         low, high = float(u[-1]), to
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
             found, ok = self._closed(q[-1:], np.array([middle]))
             near = float(np.abs(found - q[-1]).max()) <= JUMP
-            if ok[0] and near and self._inside(found)[0] and self.checker.is_free(found[0]):
+            if ok[0] and near and self._inside(found)[0] and self.checker.clearance(found[0]) >= ROOM:
                 low, u, q = middle, np.append(u, middle), np.append(q, found, axis=0)
             else:
                 high = middle
@@ -241,8 +247,7 @@ class LineTracker:
         return self.tools.close(q, *self.path.poses(u))
 
     def _inside(self, states: Array) -> Flags:
-        found: Flags = ((states >= self.lower) & (states <= self.upper)).all(axis=1)
-        return found
+        return np.asarray(((states >= self.lower) & (states <= self.upper)).all(axis=1), bool)
 
     def _guesses(self, u: Array, q: Array) -> Array:
         """Return states in the middle between neighbors by cubic interpolation, or linear next to stops."""
@@ -299,20 +304,21 @@ class LineTracker:
             bends.append(bend)
         return _Slopes(self._cost_of(track), nulls, np.stack(slopes), np.stack(bends))
 
-    def _step(self, u: Array, q: Array, null: Array, slope: Array, bend: Array, damping: float) -> Array:
-        """Return the steps along null vectors that a tridiagonal Gauss-Newton system has, shape (N,), 0 at the first."""
-        weight, span = SMOOTHNESS / np.diff(u), _spans(u)
-        pull = weight[:, None] * np.diff(q, axis=0)
-        right = -span * slope
+    def _step(self, track: Track, at: _Slopes, f: int, damping: float) -> Array:
+        """Return steps along a tool's null vectors by its tridiagonal system, shape (N,), 0 for the first state."""
+        weight, span, null = SMOOTHNESS / np.diff(track.u), _spans(track.u), at.nulls[f]
+        pull = weight[:, None] * np.diff(track.states, axis=0)
+        right = -span * at.slope[f]
         right[1:] -= (pull * null[1:]).sum(axis=1)
         right[:-1] += (pull * null[:-1]).sum(axis=1)
         size = (null * null).sum(axis=1)
-        diagonal = span * (bend + damping) + 1e-9
+        diagonal = span * (at.bend[f] + damping) + 1e-9
         diagonal[1:] += weight * size[1:]
         diagonal[:-1] += weight * size[:-1]
         beside = -weight * (null[1:] * null[:-1]).sum(axis=1)
-        found = np.append(0.0, _tridiagonal(diagonal[1:], beside[1:], right[1:]))
-        return np.clip(found, -LARGEST_MOVE, LARGEST_MOVE)
+        steps = _tridiagonal(diagonal[1:], beside[1:], right[1:])
+        found: Array = np.clip(np.append(0.0, steps), -LARGEST_MOVE, LARGEST_MOVE)
+        return found
 
     def _chosen(self, track: Track, f: int, hard: bool) -> Track:
         u = track.u
@@ -320,11 +326,11 @@ class LineTracker:
         flat = options.reshape(-1, options.shape[-1])
         usable = inside.copy()
         rows = np.flatnonzero(inside)
-        costs = np.full(len(flat), np.inf)
-        costs[rows] = self._state_costs(flat[rows], self.tools.linearizations(flat[rows]))
+        of_rows = np.full(len(flat), np.inf)
+        of_rows[rows] = self._state_costs(flat[rows], self.tools.linearizations(flat[rows]))
         if hard:
             usable.ravel()[rows] = self.checker.are_free(flat[rows])
-        costs = costs.reshape(inside.shape)
+        costs = of_rows.reshape(inside.shape)
         center = options.shape[1] // 2
         total = np.full(inside.shape, np.inf)
         total[0, center] = 0.0
@@ -368,9 +374,7 @@ class LineTracker:
             if not len(alive) or self.stop():
                 break
             rows = both[alive]
-            found, ok = self.tools.close(
-                state[alive] + SELF_STEP * way[alive], rotation[rows], point[rows], steps=5
-            )
+            found, ok = self.tools.close(state[alive] + SELF_STEP * way[alive], rotation[rows], point[rows], steps=5)
             ok &= np.abs(found - state[alive]).max(axis=1) <= 2.0 * SELF_STEP
             ok &= np.abs(way[alive]).max(axis=1) > 0.0
             inside = self._inside(found)
@@ -394,7 +398,8 @@ def _lack(values: Array, margin: float) -> Array:
 def _spans(u: Array) -> Array:
     """Return the length of the path that each parameter stands for, shape (N,)."""
     half = 0.5 * np.diff(u)
-    return np.append(0.0, half) + np.append(half, 0.0)
+    spans: Array = np.append(0.0, half) + np.append(half, 0.0)
+    return spans
 
 
 def _tridiagonal(diagonal: Array, beside: Array, right: Array) -> Array:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import pathlib
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,28 +18,29 @@ from numpy.typing import ArrayLike
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.constraints.frames import Frame, frame_of
-from apex_ompl.constraints.line import ToolPath
+from apex_ompl.constraints.line import ToolPath, are_same
 from apex_ompl.constraints.line_ends import DeadEnd, LineEnd, collision, dead_end
 from apex_ompl.constraints.line_proof import Deviation, motion_deviation, path_deviation
 from apex_ompl.constraints.line_tracking import LineTracker, Track
 from apex_ompl.constraints.links import Links
 from apex_ompl.constraints.tools import Tool, Tools
-from apex_ompl.errors import ParameterError, TimingError, TimingStoppedError
+from apex_ompl.errors import FileFormatError, ParameterError, TimingError, TimingStoppedError
 from apex_ompl.ompl.setup import state_fault
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.steps import certificate
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import Limits, digest
-from apex_ompl.scene.bodies import AttachedObject, pose_fields, pose_matrix
+from apex_ompl.robot.model import digest
+from apex_ompl.scene.bodies import pose_fields, pose_matrix
 from apex_ompl.scene.problem import PoseTarget, Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
-from apex_ompl.timing.motion_limits import MotionLimits
 from apex_ompl.timing.trajectory import ROUNDING, joined
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.display import one_line
+from apex_ompl.util.files import read_archive
+from apex_ompl.util.schema import read_json, read_yaml
 from apex_ompl.util.validation import check_number, check_positive, finite_array, rigid_pose
 
 POSITION, ANGLE = 1e-4, math.radians(0.1)
@@ -61,7 +64,7 @@ Waypoint = Pose | Mapping[str, Pose]
 class LineResult(PlanResult):
     """Outcome of one call of ``plan_line``; true only where the tools reach the last pose, and move there.
 
-    Where they do not, the status is APPROXIMATE_SOLUTION, and path and motion lead as far as they go, if anywhere.
+    Where they do not, the status is APPROXIMATE_SOLUTION, and ``path`` and ``partial_motion`` lead as far as they go.
 
     Attributes:
         share: Share of the line that ``path`` covers, 0 to 1.
@@ -69,6 +72,7 @@ class LineResult(PlanResult):
         blocked_by: Joints at their limits, or the two bodies that collide.
         line_distance: Bound of the distance of the tools' origins from the line, along path and motion [m].
         line_angle: Bound of the angle to the orientation that goes with the place on the line [rad].
+        partial_motion: The timed motion along ``path`` where that does not reach the end; files do not hold it.
     """
 
     share: float = 0.0
@@ -76,12 +80,41 @@ class LineResult(PlanResult):
     blocked_by: tuple[str, ...] = ()
     line_distance: float = nan
     line_angle: float = nan
+    partial_motion: Trajectory | None = None
 
     def __repr__(self) -> str:
         """Return the status, the share and what was found, in one line."""
-        motion = "" if self.trajectory is None else f"motion {self.trajectory.duration:.3f} s"
+        made = self.trajectory or self.partial_motion
+        motion = "" if made is None else f"motion {made.duration:.3f} s"
         share = f"{100.0 * self.share:.4g} % of the line"
         return one_line("LineResult", str(self.status), repr(self.problem.name), share, motion, self.reason)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the fields as plain data, ready for JSON, those of the line as ``line``."""
+        line = {name: getattr(self, name) for name in ("share", "end", "blocked_by", "line_distance", "line_angle")}
+        line |= {name: None for name, value in line.items() if isinstance(value, float) and math.isnan(value)}
+        return super().as_dict() | {"line": line | {"end": str(self.end), "blocked_by": list(self.blocked_by)}}
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> LineResult:
+        """Read a result that was saved as .npz, .json or .yaml.
+
+        Raises:
+            ApexError: As :meth:`apex_ompl.PlanResult.load`, or the file holds no line.
+        """
+        found, file = super().load(path), os.fspath(path)
+        assert isinstance(found, LineResult)
+        if file.endswith(".npz"):
+            data = read_archive(pathlib.Path(file), "result", "result file")[0]
+        else:
+            data = (read_json if file.endswith(".json") else read_yaml)(pathlib.Path(file), "result file")
+        try:
+            line = data["line"]
+            distance, angle = (nan if line[k] is None else float(line[k]) for k in ("line_distance", "line_angle"))
+            share, end, blocked_by = float(line["share"]), LineEnd(line["end"]), tuple(map(str, line["blocked_by"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise FileFormatError(file, "line", str(error), "expected the result of a line") from error
+        return replace(found, share=share, end=end, blocked_by=blocked_by, line_distance=distance, line_angle=angle)
 
 
 class LineQuery(NamedTuple):
@@ -107,7 +140,7 @@ class LineQuery(NamedTuple):
 
 
 def line_query(
-    checker: CollisionChecker, start: Array, pose: Waypoint | Sequence[Waypoint], frame: str | None, blend: float,
+    checker: CollisionChecker, start: Array, pose: Waypoint | Sequence[Waypoint], *, frame: str | None, blend: float,
     speed: float | None, timing: bool | Timing, problem: Callable[[Sequence[PoseTarget]], Problem],
 ) -> LineQuery:  # fmt: skip
     """Return what a plan along a line is about.
@@ -148,7 +181,7 @@ def line_query(
     for k, waypoint in enumerate(waypoints, 1):
         for f, name in enumerate(names):
             poses[k, f] = _matrix(waypoint[name], poses[k - 1, f], frames[f].axial, f"pose of {name}")
-    goals = [PoseTarget(frame=name, **pose_fields(poses[-1, f])) for f, name in enumerate(names)]
+    goals = [PoseTarget.model_validate({"frame": n, **pose_fields(poses[-1, f])}) for f, n in enumerate(names)]
     if how is not None:
         how.motion_limits(robot, tuple(checker.held.values()))  # checked before planning
     return LineQuery(problem(goals), q, tools, poses, float(blend), speed, how)
@@ -168,37 +201,36 @@ def plan_along(checker: CollisionChecker, query: LineQuery, deadline: Deadline, 
     """
     started, times = clock.perf_counter(), dict[str, float]()
     robot, start = checker.robot, query.start
-    still = np.abs(query.poses[1:] - query.poses[:-1]).max() == 0.0
-    path = None if still else ToolPath.through(query.poses, query.blend)
+    path = None if are_same(query.poses) else ToolPath.through(query.poses, query.blend)
     result = LineResult(
         status=PlanStatus.EXACT_SOLUTION, reason="", problem=query.problem, robot=robot.name,
         joint_names=robot.joint_names, planner=NAME, seed=0, robot_digest=digest(robot), solved_by=NAME,
     )  # fmt: skip
     fault = state_fault(checker, start)
     if fault:
-        return replace(result, status=PlanStatus.INVALID_START, reason=fault, end=LineEnd.COLLISION, solved_by="")
+        kind = LineEnd.JOINT_LIMIT if robot.limit_fault(start) else LineEnd.COLLISION
+        return replace(result, status=PlanStatus.INVALID_START, reason=fault, end=kind, solved_by="")
     if path is None:
-        result = replace(result, path=Path(start[None]), share=1.0, length=0.0)
-        return result
+        rest = time_path(start[None], robot.limits, robot.joint_names).trajectory if query.timing else None
+        return replace(result, path=Path(start[None]), trajectory=rest, share=1.0, length=0.0, line_distance=0.0)
     tracker = LineTracker(checker, query.tools, path, lambda: ends() or deadline.for_search <= 0.0)
     with timed(times, "solve"):
         track, end = _followed(tracker, start)
     with timed(times, "verify"):
-        track, proof, end = _proved(tracker, track, end, deadline)
-    result = replace(result, checks=checker.check_counts.states)
+        track, proof, off, end = _proved(tracker, track, end, deadline)
     if proof is None:
         return replace(result, **_stopped(end, 0.0), times={**times, "total": clock.perf_counter() - started})
     share = 1.0 if end is None else float(track.u[-1]) / path.length
     found = Path(track.states)
-    off = path_deviation(tracker.tools, path, track.u, track.states)
     result = replace(
         result, path=found, length=found.length, line_distance=off.position, line_angle=off.angle,
         **certificate(proof), **({"share": 1.0} if end is None else _stopped(end, share)),
     )  # fmt: skip
     if query.timing is not None and len(track.u) > 1:
         with timed(times, "timing"):
-            result = _timed(tracker, track, query, query.timing, result, deadline, ends)
-    return replace(result, times={**times, "total": clock.perf_counter() - started})
+            result = _timed(tracker, track, query, result, deadline, ends=ends)
+    times["total"] = clock.perf_counter() - started
+    return replace(result, times=times, checks=checker.check_counts.states)
 
 
 def _followed(tracker: LineTracker, start: Array) -> tuple[Track, DeadEnd | None]:
@@ -218,38 +250,33 @@ def _followed(tracker: LineTracker, start: Array) -> tuple[Track, DeadEnd | None
 
 def _proved(
     tracker: LineTracker, track: Track, end: DeadEnd | None, deadline: Deadline
-) -> tuple[Track, PathProof | None, DeadEnd | None]:
-    """Return the longest part of a track that is proved, its proof if any, and why it ends."""
+) -> tuple[Track, PathProof | None, Deviation, DeadEnd | None]:
+    """Return the longest part of a track that is proved, its proof if any, its deviation, and why it ends."""
     for _ in range(CUTS):
         check = full_check(tracker.checker, track.states, track.states[0], deadline=deadline.at)
         off = path_deviation(tracker.tools, tracker.path, track.u, track.states)
-        if check and off.position <= POSITION and off.angle <= ANGLE:
-            return track, check.proof, end
-        if check.timed_out:
-            return track, None, _OUT_OF_TIME
-        if check:  # too few states, as there was no time to refine
-            return track, None, end or _OUT_OF_TIME
-        k = check.segment or 0
+        if check.timed_out or (check and max(off.position / POSITION, off.angle / ANGLE) > 1.0):
+            return track, None, off, _OUT_OF_TIME  # too few states, as there was no time to refine
+        if check:
+            return track, check.proof, off, end
         end = DeadEnd(LineEnd.COLLISION, (), check.reason)
         if check.proof is not None:
-            free = tracker.checker.is_free(check.proof.state)
-            end = DeadEnd(LineEnd.COLLISION, check.proof.pair, check.proof.reason) if free else collision(
-                tracker, check.proof.state
-            )
-        track = track.upto(k + 1)
-        if k == 0:
-            break
-    return track, full_check(tracker.checker, track.states[:1], track.states[0]).proof, end
+            state, proof = check.proof.state, check.proof
+            touching = DeadEnd(LineEnd.COLLISION, proof.pair, proof.reason)
+            end = touching if tracker.checker.is_free(state) else collision(tracker, state)
+        track = track.upto((check.segment or 0) + 1)
+    return track, None, off, end
 
 
 def _timed(
-    tracker: LineTracker, track: Track, query: LineQuery, timing: Timing, result: LineResult, deadline: Deadline,
+    tracker: LineTracker, track: Track, query: LineQuery, result: LineResult, deadline: Deadline, *,
     ends: Callable[[], bool],
 ) -> LineResult:  # fmt: skip
     """Return a result with its motion, or why there is none."""
+    assert query.timing is not None
     robot, checker, tools, path = tracker.checker.robot, tracker.checker, tracker.tools, tracker.path
     limits, names = robot.limits, robot.joint_names
-    how = _with_speed(replace(timing, deviation=min(timing.deviation, JOINT_DEVIATION)), query)
+    how = _with_speed(query, query.timing)
     scaled, held = how.limits(limits, names), tuple(checker.held.values())
     more = how.motion_limits(robot, held, query.problem.payload)
     parts, offs, clear = list[Trajectory](), [Deviation(result.line_distance, result.line_angle)], [math.inf]
@@ -276,22 +303,21 @@ def _timed(
         except TimingStoppedError:
             return replace(result, status=PlanStatus.TIMEOUT, reason="a path was found but not timed in time")
         except TimingError as error:
-            return replace(
-                result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}"
-            )
+            return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
         parts.append(motion)
         joint_deviation, method = max(joint_deviation, made.deviation), made.method
     motion = joined(parts)
-    use = motion.use(limits) | ({} if more is None else more.use(motion))
-    return replace(
-        result, trajectory=motion, limit_use=use, deviation=joint_deviation, timing_method=method,
-        motion_clearance=min(clear), line_distance=max(off.position for off in offs),
+    result = replace(
+        result, limit_use=motion.use(limits) | ({} if more is None else more.use(motion)), deviation=joint_deviation,
+        timing_method=method, motion_clearance=min(clear), line_distance=max(off.position for off in offs),
         line_angle=max(off.angle for off in offs),
     )  # fmt: skip
+    return replace(result, trajectory=motion) if result else replace(result, partial_motion=motion)
 
 
-def _with_speed(timing: Timing, query: LineQuery) -> Timing:
-    """Return a timing with the speed of the tools among its limits."""
+def _with_speed(query: LineQuery, timing: Timing) -> Timing:
+    """Return a timing near the joint path, with the speed of the tools among its limits."""
+    timing = replace(timing, deviation=min(timing.deviation, JOINT_DEVIATION))
     if query.speed is None:
         return timing
     given, mine = timing.max_tool_speed, {tool.name: query.speed for tool in query.tools}

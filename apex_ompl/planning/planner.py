@@ -358,8 +358,8 @@ class MotionPlanner:
                 checker = self._checker_without(self._absent())
                 checker.check_counts = CheckCounts()
                 query = lines.line_query(
-                    checker, state_array(self.robot, start, "start"), pose, frame, blend, speed, timing,
-                    lambda goals: self.problem(start, goals, name),
+                    checker, state_array(self.robot, start, "start"), pose, frame=frame, blend=blend, speed=speed,
+                    timing=timing, problem=lambda goals: self.problem(start, goals, name),
                 )  # fmt: skip
                 warm_up()
             deadline = Deadline(timeout)
