@@ -297,8 +297,10 @@ def _timed(
                 clear.append(check.proof.clearance)
             return check.reason
 
+        share = (u[-1] - u[0]) / track.u[-1]
+        section = replace(how, minimum_duration=float(share * how.minimum_duration))
         try:
-            made = time_path(states, limits, names, how, fault, stop=ends, motion_limits=more)
+            made = time_path(states, limits, names, section, fault, stop=ends, motion_limits=more)
             motion = _slowed(made.trajectory, tools, query.speed, fault)
         except TimingStoppedError:
             return replace(result, status=PlanStatus.TIMEOUT, reason="a path was found but not timed in time")

@@ -199,9 +199,7 @@ def off_the_line(tracker: LineTracker, states: Array) -> tuple[float, float]:
     return distance.max(), max(np.linalg.norm(pin.log3(w.T @ r)) for w, r in zip(wanted, rotation[:, 0], strict=True))
 
 
-def test_refined_tracks_keep_the_line_and_bounds_hold_between_their_states(
-    robot: Robot, tracker: LineTracker
-) -> None:
+def test_refined_tracks_keep_the_line_and_bounds_hold_between_their_states(robot: Robot, tracker: LineTracker) -> None:
     track = tracker.refined(tracker.follow(robot.home))
     assert np.array_equal(track.states[0], robot.home) and track.u[-1] == tracker.path.length
     assert (np.abs(np.diff(track.states, axis=0)) <= JUMP).all()
