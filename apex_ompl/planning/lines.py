@@ -305,7 +305,10 @@ def _timed(
         except TimingStoppedError:
             return replace(result, status=PlanStatus.TIMEOUT, reason="a path was found but not timed in time")
         except TimingError as error:
-            return replace(result, status=PlanStatus.TIMING_FAILED, reason=f"the path cannot be timed, {error}")
+            fault_of_all = f"the path cannot be timed, {error}"
+            if not result:  # which says already why the line ends early
+                return replace(result, reason=f"{result.reason}; {fault_of_all}")
+            return replace(result, status=PlanStatus.TIMING_FAILED, reason=fault_of_all)
         parts.append(motion)
         joint_deviation, method = max(joint_deviation, made.deviation), made.method
     motion = joined(parts)
