@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from constraint_groups import Placed, Real, Sample, Tree, sample
 from hypothesis import given, settings
@@ -242,6 +243,31 @@ def test_a_spike_between_the_states_that_are_examined_first_is_found(is_motion: 
     assert curve.prove(rows).proved == (not is_motion)
     for share, is_proved in ((1.001, not is_motion), (0.999, False)):
         assert curve.prove(tip_rows(tables, 1.0, share * (1.0 - math.cos(1.0)), 1, 1.0)).proved == is_proved
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_second_order_terms_are_those_of_chains_for_which_they_add_up(kind: int) -> None:
+    """Of a stretched arm, and of two crossed joints, on an interval around a state: the bound is all but exact."""
+    size = 0.02
+    if kind == POSITION:  # joints that turn the same way fold a stretched arm
+        step, rows = np.full(3, size), tip_rows(planar(0.5, 0.4, 0.3), 0.3, 1.0, 1, 1.2)
+    else:  # the first joint turns the change that the second one makes
+        step = np.array([5.0 * size, size] if kind == AXIS else [size, size])
+        axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+        specs = [JointSpec(0), *(JointSpec(k, REVOLUTE, np.eye(4), axes[k], k) for k in range(2))]
+        tree = JointTree(specs)
+        box = np.ones(2)
+        tables = robot_builder.robot_tables(
+            "crossed", ["a", "b"], lower=-box, upper=box, tree=tree, bodies=[], pairs=[]
+        )  # fmt: skip
+        away = pin.exp3(np.array([0.3, 0.0, 0.0]))  # along the product of the axes, -x, or across both
+        first, second = JointFrame(0, away, np.zeros(3)), JointFrame(2, tree.turns[2][:3, :3].T, np.zeros(3))
+        rows = ConstraintRows(tables, [ConstraintGroup(kind, 2 if kind == AXIS else 3, first, second, 1.0)])
+    at = rows.norms(0.0 * step)[0, 0]
+    true = rows.norms(np.linspace(-1.0, 1.0, 41)[:, None] * step).max() - at
+    bound = prove_path(rows, [-step, step]).bounds[0] - at
+    assert true > 0.1 * size**2
+    assert true - 1e-12 <= bound <= 1.25 * true
 
 
 @pytest.mark.parametrize("angle", [1e-3, 0.2, 1.0, 1.7, 2.5, 3.1])
