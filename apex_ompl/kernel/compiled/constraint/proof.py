@@ -6,8 +6,8 @@ with x = m + u h and |u| <= 1, its states are
     q = q_m + delta,   delta = u s + u^2 b + u^3 c + e,   |e_i| <= d_i,
 
 s, b and c the derivatives of Taylor's theorem, d rounding and gaps between pieces, so that |delta_i| <= w_i =
-|s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A. Let
-y be the place p of B, its z axis, or twice the vector part of its quaternion, each seen from A, and a_i the axis of
+|s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A.
+Let y be the place p of B, its z axis, or twice the vector part of its quaternion, each seen from A, and a_i the axis of
 joint i through o_i, all at q_m. With
 
     far_i = |a_i x (p - o_i)|  (for the z axis |a_i x z|; for prismatic joints 1, and 0 for the z axis),
@@ -23,8 +23,8 @@ independent. So |y| is at most
 
     max |y_m +- J s + {0, 1} J b| + |J c| + sum_i d_i far_i + the remainder above,
 
-which is a bound on |r| for POSITION, on sin(theta) for AXIS where z_A . z_B, bounded likewise, stays positive, and on
-2 sin(theta / 2) for ROTATION. Another bound is |r| <= |r_m| + m_0. The derivation is in docs/constraints.md.
+which is a bound on |r| for POSITION, on sin(theta) for AXIS where z_A . z_B, bounded in the same way, is positive, and
+on 2 sin(theta / 2) for ROTATION. Another bound is |r| <= |r_m| + m_0. The derivation is in docs/constraints.md.
 """
 
 from __future__ import annotations
