@@ -279,7 +279,7 @@ class ConstraintSet:
     def _states(self, states: ArrayLike) -> Array:
         return np.array(states, float, ndmin=2)
 
-    def newton(self, q: Array, also: Residual | None = None, *, steps: int = NEWTON_STEPS) -> tuple[Array, bool]:
+    def newton(self, q: Array, also: Residual | None = None, *, steps: int = STEPS) -> tuple[Array, bool]:
         """Return the end of Newton's method with the pseudoinverse from a state, and whether it arrived.
 
         A joint that a step takes beyond a limit stays out of the next step.
