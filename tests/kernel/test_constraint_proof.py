@@ -372,7 +372,9 @@ def test_a_tray_between_two_arms_is_proved_and_checked_by_pinocchio(robot: Robot
     ]
     found, hands = Sample(real, groups, pairs), robot.groups["hands"]
     rows = ConstraintRows(real.tables, groups, fixed=hands)
-    goals, ok = rows.project(np.where(np.isin(np.arange(robot.dof), hands), 0.0, 0.3) * rng.normal(size=(40, robot.dof)) + robot.home)
+    goals, ok = rows.project(
+        np.where(np.isin(np.arange(robot.dof), hands), 0.0, 0.3) * rng.normal(size=(40, robot.dof)) + robot.home
+    )
     goal = goals[ok][0]
     path, ok = rows.project(robot.home + np.linspace(0.0, 1.0, 65)[:, None] * (goal - robot.home))
     assert ok.all()

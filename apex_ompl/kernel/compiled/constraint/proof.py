@@ -6,8 +6,8 @@ with x = m + u h and |u| <= 1, its states are
     q = q_m + delta,   delta = u s + u^2 b + u^3 c + e,   |e_i| <= d_i,
 
 s, b and c the derivatives of Taylor's theorem, d rounding and gaps between pieces, so that |delta_i| <= w_i =
-|s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A. Let
-y be the place of B, its z axis, or twice the vector part of its quaternion, each seen from A. On all of this box, for
+|s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A.
+Let y be the place of B, its z axis, or twice the vector part of its quaternion, each seen from A. On this box, for
 
     far_i = |a_i x (p - o_i)| at q_m,   arm_i = far_i + m_i,   m_i = sum of w_k arm_k over k > i,
 
@@ -17,8 +17,8 @@ places and 0 for axes), the distance of p from the axis of joint i is at most ar
     |y(q) - y_m - J delta| <= 1/2 sum_i w_i arm_i (w_i + 2 sum_k w_k),
 
 the inner sum over revolute joints k < i, the first term for revolute joints i alone. For the quaternion the sum is
-sum_i (v w_i^2 / 2 + w_i sum_{k < i} w_k), v >= |vector part| on the box. J delta is u J s + u^2 J b + u^3 J c + J e, and
-a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were independent. So |y| is at most
+sum_i (v w_i^2 / 2 + w_i sum_{k < i} w_k), v >= |vector part| on the box. J delta is u J s + u^2 J b + u^3 J c + J e,
+and a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were independent. So |y| is at most
 
     max |y_m +- J s + {0, 1} J b| + |J c| + sum_i d_i far_i + half the sum above,
 
