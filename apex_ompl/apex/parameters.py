@@ -66,6 +66,7 @@ class ApexParameters(Parameters):
     """
 
     smooth: ClassVar[bool] = True
+    constrained: ClassVar[bool] = True
     model: str = AUTO
     robot: str = AUTO
     device: str = "cpu"

@@ -8,6 +8,8 @@ from typing import Any
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.constraints.constraint_set import ConstraintSet
+from apex_ompl.ompl.constrained_space import constraint_of, projected_space
 from apex_ompl.ompl.process import ends_after
 from apex_ompl.ompl.space import Bounds, await_goal, state_space
 from apex_ompl.robot import Robot
@@ -31,22 +33,51 @@ class SpaceInformation(ob.SpaceInformation):
         super().setStateValidityChecker(_of_truth(svc))
 
 
+class ConstrainedSpaceInformation(ob.ConstrainedSpaceInformation):
+    """As :class:`SpaceInformation`, of a state space under constraints along the path.
+
+    Attributes:
+        robot: The robot.
+        constraint: The constraints, as the state space has them.
+    """
+
+    def __init__(self, space: ob.ProjectedStateSpace, robot: Robot) -> None:
+        """Describe a space of a robot, see :func:`apex_ompl.ompl.constrained_space.projected_space`."""
+        super().__init__(space)
+        self.robot, self.constraint = robot, constraint_of(space)
+
+    def setStateValidityChecker(self, svc: ob.StateValidityChecker | Callable[[Any], Any]) -> None:  # noqa: N802 - OMPL's name
+        """Set the checker that decides from now on; a function may return anything that is true or false."""
+        super().setStateValidityChecker(_of_truth(svc))
+
+
+RobotSpaceInformation = SpaceInformation | ConstrainedSpaceInformation
+
+
 class SimpleSetup(og.SimpleSetup):
-    """OMPL's SimpleSetup in the state space of a robot.
+    """OMPL's SimpleSetup in the state space of a robot, under constraints along the path where there are some.
 
     Beyond OMPL's own, checkers may return ``numpy.bool_``; ``solve`` lets goals be sampled by Python in another thread;
     ``getPlannerData`` knows this package's planners; and a daemon thread inside of ``solve`` when the interpreter ends
     is ended in order.
     """
 
-    def __init__(self, robot: Robot, bounds: Bounds | None = None) -> None:
+    def __init__(self, robot: Robot, bounds: Bounds | None = None, constraints: ConstraintSet | None = None) -> None:
         """Make a setup without checker, start and goal.
 
         Args:
             robot: The robot.
             bounds: Bounds of the state space, by default the robot's limits.
+            constraints: Constraints along the path, or None for none.
+
+        Raises:
+            ConstraintError: They leave no joint free.
         """
-        super().__init__(SpaceInformation(state_space(robot, bounds=bounds), robot))
+        space = state_space(robot, bounds=bounds)
+        if constraints is None:
+            super().__init__(SpaceInformation(space, robot))
+        else:
+            super().__init__(ConstrainedSpaceInformation(projected_space(space, constraints), robot))
 
     def setStateValidityChecker(self, svc: ob.StateValidityChecker | Callable[[Any], Any]) -> None:  # noqa: N802 - OMPL's name
         """Set the checker that decides from now on; a function may return anything that is true or false."""
