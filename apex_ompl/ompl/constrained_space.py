@@ -7,7 +7,8 @@ between two states of the manifold leaves it, so motions are checked along its p
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from ompl import base as ob
@@ -48,6 +49,7 @@ class ManifoldConstraint(ob.Constraint):
         self.constraints = constraints
         self.stop: Callable[[], bool] = lambda: False
         self.fault: BaseException | None = None
+        self._condition: ob.PlannerTerminationCondition | None = None
         dof, rows = constraints.robot.dof, len(self.rows(constraints.start)[0])
         if rows >= dof:
             raise ConstraintError(", ".join(constraints.names), f"{rows} rows, expected fewer than {dof} joints")
@@ -76,7 +78,7 @@ class ManifoldConstraint(ob.Constraint):
         try:
             out[:] = self.rows(np.array(x))[0]
         except BaseException as error:
-            self.fault = self.fault or error
+            self._keep(error)
             out[:] = np.inf
 
     def jacobian(self, x: Array, out: Array) -> None:
@@ -84,7 +86,7 @@ class ManifoldConstraint(ob.Constraint):
         try:
             out[:] = self.rows(np.array(x))[1]
         except BaseException as error:
-            self.fault = self.fault or error
+            self._keep(error)
             out[:] = 0.0
 
     def isSatisfied(self, x: Array | ob.State) -> bool:  # noqa: N802 - OMPL's name
@@ -94,7 +96,7 @@ class ManifoldConstraint(ob.Constraint):
                 x if isinstance(x, np.ndarray) else to_array(x, self.constraints.robot.dof)
             )
         except BaseException as error:
-            self.fault = self.fault or error
+            self._keep(error)
             return False
 
     def project(self, x: Array) -> bool:
@@ -106,8 +108,23 @@ class ManifoldConstraint(ob.Constraint):
             x[:] = found.states[0]
             return bool(found.ok[0])
         except BaseException as error:
-            self.fault = self.fault or error
+            self._keep(error)
             return False
+
+
+    @contextmanager
+    def ends_on_fault(self, condition: ob.PlannerTerminationCondition) -> Iterator[None]:
+        """While the block runs, let an exception of a constraint end the planner that watches ``condition``."""
+        self._condition = condition
+        try:
+            yield
+        finally:
+            self._condition = None
+
+    def _keep(self, error: BaseException) -> None:
+        self.fault = self.fault or error
+        if self._condition is not None:
+            self._condition.terminate()
 
 
 def _outside(r: Array, jacobian: Array, slack: float) -> tuple[Array, Array]:
@@ -131,7 +148,7 @@ def projected_space(space: ob.RealVectorStateSpace, constraints: ConstraintSet) 
     made = ob.ProjectedStateSpace(space, ManifoldConstraint(constraints))
     made.setDelta(DELTA)
     made.setLambda(LAMBDA)
-    made.setName(constraints.robot.name)
+    space.setName(constraints.robot.name)  # OMPL has changed it; the bindings cannot set that of the projected one
     return made
 
 

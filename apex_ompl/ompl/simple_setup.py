@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 from ompl import base as ob
@@ -87,7 +88,9 @@ class SimpleSetup(og.SimpleSetup):
         """Solve within a time [s], or until a condition holds."""
         given = time if ptc is None else ptc
         ptc = given if isinstance(given, ob.PlannerTerminationCondition) else ends_after(given)
-        with running(ptc.terminate):
+        constraint = constraint_of(self.getStateSpace())
+        ending = nullcontext() if constraint is None else constraint.ends_on_fault(ptc)
+        with running(ptc.terminate), ending:
             self.setup()  # sampling begins after it
             await_goal(self.getGoal(), ptc)
             return super().solve(ptc)

