@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import nan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ompl import base as ob
@@ -28,9 +28,6 @@ from apex_ompl import planners
 from apex_ompl.apex.parameters import NAME, ApexParameters
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.proof import ConstraintCertificate, prove_motion
-from apex_ompl.constraints.user import UserConstraint
 from apex_ompl.errors import ApexError, ParameterError, TimingError, TimingStoppedError
 from apex_ompl.ompl import setup as ompl_setup
 from apex_ompl.ompl.constrained_space import CONSTRAINED, ManifoldLength
@@ -60,6 +57,11 @@ from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.display import one_line
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.validation import check_positive
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.proof import ConstraintCertificate
+    from apex_ompl.constraints.user import UserConstraint
 
 STRAIGHT_LINE = "straight line"
 UNNAMED = "unnamed"  # planner of a user's function before it is made
@@ -597,6 +599,8 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         result = replace(result, path=better.path, **certificate(better.path_proof))
     assert made is not None
     if setup.constraints is not None:
+        from apex_ompl.constraints.proof import prove_motion
+
         kept = prove_motion(setup.constraints, made.trajectory)
         result = replace(result, **_constraint_fields(setup.constraints, kept))
     use = made.trajectory.use(limits) | ({} if more is None else more.use(made.trajectory))
