@@ -46,7 +46,7 @@ MOST_ROWS = {POSITION: 3, AXIS: 2, ROTATION: 3}
 LONGEST, PIECES = 0.15, 2  # of an edge of trees [rad], and its chords
 MOST_EDGES = 200  # of a connection
 AT_ONCE = 8  # random states between two looks at the clock
-ORTHOGONAL = 1e-6
+ORTHOGONAL = 1e-12
 
 
 class JointFrame(NamedTuple):

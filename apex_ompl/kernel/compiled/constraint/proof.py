@@ -7,12 +7,8 @@ with x = m + u h and |u| <= 1, its states are
 
 s, b and c the derivatives of Taylor's theorem, d rounding and gaps between pieces, so that |delta_i| <= w_i =
 |s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A.
-<<<<<<< HEAD
-Let y be the place of B, its z axis, or twice the vector part of its quaternion, each seen from A. On this box, for
-=======
 Let y be the place p of B, its z axis, or twice the vector part of its quaternion, each seen from A, and a_i the axis of
 joint i through o_i, all at q_m. With
->>>>>>> conproof
 
     far_i = |a_i x (p - o_i)|  (for the z axis |a_i x z|; for prismatic joints 1, and 0 for the z axis),
     m_i = sum of w_k far_k over k > i,
@@ -21,15 +17,9 @@ products of exponentials show that y moves by at most m_0 on this box, and that
 
     |y(q) - y_m - J delta| <= sum of w_i (w_i far_i / 2 + m_i) over revolute joints.
 
-<<<<<<< HEAD
-the inner sum over revolute joints k < i, the first term for revolute joints i alone. For the quaternion the sum is
-sum_i (v w_i^2 / 2 + w_i sum_{k < i} w_k), v >= |vector part| on the box. J delta is u J s + u^2 J b + u^3 J c + J e,
-and a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were independent. So |y| is at most
-=======
 For the quaternion it is sum_i w_i (w_i |y_m| / 8 + w_i^2 / 24 + m_i / 2) with far_i = 1. J delta is
 u J s + u^2 J b + u^3 J c + J e, and a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were
 independent. So |y| is at most
->>>>>>> conproof
 
     max |y_m +- J s + {0, 1} J b| + |J c| + sum_i d_i far_i + the remainder above,
 
