@@ -1,8 +1,8 @@
 """Other paths, from which faster motions are optimized until the time of an anytime plan ends.
 
-They are of other homotopies, or lead to other goals: paths of new trees, proposals of the model, the best motion led
-through a random free state or moved at random, and straight lines through random free states. Goals that are given in
-the workspace are sampled again.
+They are of other homotopies, or lead to other goals: paths of new trees and of the planner with other seeds, the best
+motion led through a random free state or moved at random, and straight lines through random free states. Goals that are
+given in the workspace are sampled again.
 """
 
 from __future__ import annotations
@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from apex_ompl.apex.models import ProposalSampler, make_query, trajectory_model
 from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.goals.goal_sampling import WorkspaceGoal, sample
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
-from apex_ompl.ompl.own_planner import SolveReport
-from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
-from apex_ompl.paths.path import SEARCH_RESOLUTION, Path, resample
+from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, assemble, workspace_goal
+from apex_ompl.paths.path import SEARCH_RESOLUTION, resample
+from apex_ompl.planning.query import goal_record
 from apex_ompl.robot.model import Limits
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.clocks import Deadline
 
 if TYPE_CHECKING:
     from apex_ompl.planning.steps import PlanQuery
@@ -36,7 +36,7 @@ SPREADS = 0.3, 0.6, 1.0  # of random states around a path [rad]
 SHIFTS = 0.05, 0.8  # least and largest size of a random movement of the best motion [rad]
 WIDTHS = 0.1, 0.5  # and of its width, as a share of the motion
 ATTEMPTS = 20  # for a random free state
-BATCH = 4  # proposals of the model at once
+SHARE, MOST_SEED = 0.2, 2**31 - 2  # of the time left that the planner has for a path, and its seeds
 FEW_STATES, DEEP = 33, 0.01  # of a path, and their mean depth in obstacles beyond which it is left out [m]
 
 
@@ -79,7 +79,7 @@ class OtherPaths:
 
     def paths(self) -> Iterator[Array]:
         """Yield paths, shape (N, dof), until the time ends or no goal is left that could be reached sooner."""
-        kinds = self._lines, self._trees, self._moved, self._led, self._proposals, self._moved, self._led, self._through
+        kinds = self._lines, self._trees, self._moved, self._led, self._planned, self._moved, self._led, self._through
         while self._goal is not None or len(self._goals()):
             for kind in kinds:
                 if self._stop():
@@ -126,20 +126,27 @@ class OtherPaths:
         if path is not None:
             yield self._between(path, path[0], path[-1])
 
-    def _proposals(self) -> Iterator[Array]:
-        """Yield proposals of the planner's model."""
-        setup, ends, parameters = self.query.setup, self._ends(), self._parameters
-        if ends is None:
+    def _planned(self) -> Iterator[Array]:
+        """Yield the path of the planner with another seed: proposals of its model, repaired, rather than a sprint."""
+        from apex_ompl.planning import steps  # which imports this module
+
+        setup, goals, names = self.query.setup, self._goals(), self.query.setup.robot.joint_names
+        if not len(goals):
             return
-        model = trajectory_model(parameters.model, setup.robot.name, parameters.device)
-        sampler = ProposalSampler(
-            model, self._kernel, parameters.sampling(model.sampling), generator=self._rng, stop=self._stop,
-            report=SolveReport(),
+        ends = {
+            "start": dict(zip(names, setup.start.tolist(), strict=True)),
+            "goal": goal_record(setup.robot, list(goals), {}),
+        }  # fmt: skip
+        moving = [name for k, name in enumerate(names) if k not in setup.held]
+        seed = int(self._rng.integers(MOST_SEED))
+        other = assemble(setup.problem.model_copy(update=ends), setup.robot, seed, setup.checker, moving)
+        query = steps.PlanQuery(
+            other, self.query.planner, self._parameters.changed(seed=seed, sprint=0),
+            Deadline(SHARE * self.query.deadline.remaining), interrupt=self.query.interrupt,
         )  # fmt: skip
-        with model.one_thread():
-            control = sampler.propose([make_query(setup.checker, *ends, point=model.sees_point)], BATCH)
-        for one in () if control is None else control:
-            yield self._between(Path.on(model.spline, one).states, *ends)
+        found = steps.solve(query, lines=False)
+        if found and found.path is not None:
+            yield steps.with_exact_ends(other, found.path).states
 
     def _led(self) -> Iterator[Array]:
         """Yield the path of the best motion with a random free state in place of a stretch."""

@@ -44,7 +44,7 @@ DETOUR, WAYS = 1.15, 2  # ratio of a duration to the direct one, beyond which so
 AS_SOON = 0.99  # share of the duration that these must not reach
 SLIGHTLY = 0.998  # the same of an anytime plan
 ROUNDED = 1e-6  # to whole nanoseconds of each span [s]
-LAST = 0.03  # time of such a plan in which no further path is tried [s]
+LAST = 0.05  # time of such a plan in which no further path is tried [s]
 SHARE = 0.5  # of the time left
 FITTED = 0.02  # largest deviation of a motion that is timed anew for limits of torques and tool speeds [rad]
 

@@ -77,15 +77,13 @@ def test_paths_are_improved_for_a_length_or_without_a_motion(limited: Limited, m
         assert planned(params=ANYTIME, **options)
     assert asked == [True] * 3 and not tried
     assert planned() and asked == [True] * 3 + [False] and not tried
-    assert planned(params=ANYTIME) and asked[4:] == [False] and len(tried) == 2
+    assert planned(params=ANYTIME) and asked[4:] and not any(asked[4:]) and len(tried) == 2
 
 
 def test_calm_and_long_motions(limited: Limited) -> None:
-    plain, tried = planned(), limited(4)
+    plain, tried = planned(objective="calm"), limited(4)
     calm = planned(params=ANYTIME, objective="calm")
-    assert duration(calm) < 0.99 * 1.1 * duration(plain) and len(tried) == 4
-    assert calm.trajectory is not None and plain.trajectory is not None
-    assert calm.trajectory.jerk < 0.8 * plain.trajectory.jerk
+    assert duration(calm) < 0.99 * duration(plain) and len(tried) == 4
     long = planned(params=ANYTIME, timing=Timing(minimum_duration=4.0))
     assert duration(long) == pytest.approx(4.0, abs=1e-6) and len(tried) == 5
 
@@ -114,7 +112,10 @@ def test_paths_join_the_start_and_goals_and_joints_that_stay_do_so(limited: Limi
         assert (path >= limits.lower).all() and (path <= limits.upper).all()
         assert (path[:, hands] == query.setup.start[hands]).all()
     assert len({path.tobytes() for _, path in tried}) == 12
-    assert (result.trajectory.positions[:, hands] == tried[0][0].setup.start[hands]).all()
+    np.testing.assert_allclose(
+        result.trajectory.positions[:, hands], np.tile(start[hands], (len(result.trajectory.times), 1))
+    )
+    assert result.path is not None and (result.path.states[:, hands] == start[hands]).all()
 
 
 def test_goals_in_the_workspace_are_sampled_again(limited: Limited) -> None:
