@@ -115,7 +115,8 @@ class OtherPaths:
         found = sample(self._goal, setup.checker, self._rng.spawn(1)[0], GOAL_STATES, GOAL_ATTEMPTS).states
         found[:, setup.held] = setup.start[setup.held]
         goals = np.concatenate([setup.valid_goals, found])
-        self.query.setup = replace(setup, goals=goals, goal_faults=("",) * len(goals))
+        none = ("",) * len(goals)
+        self.query.setup = replace(setup, goals=goals, goal_faults=none, goals_off=none)
         for goal in self._sooner(found):
             yield np.stack([setup.start, goal])
 
