@@ -8,9 +8,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import pinocchio as pin
-from apex_ompl.goals.inverse_kinematics import Links
 from random_robots import frames, pose, random_robot
 
+from apex_ompl.constraints.links import Links
 from apex_ompl.kernel import RobotTables
 from apex_ompl.kernel.constraints import AXIS, POSITION, ROTATION, ConstraintGroup, ConstraintRows, JointFrame
 from apex_ompl.kernel.joint_tree import JointTree
