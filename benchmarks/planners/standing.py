@@ -42,7 +42,7 @@ def main() -> None:
     levels = [level for level in record.static_levels(args.levels) if level.split("/")[1] in KINDS]
     if not levels:
         parser.error(f"no level of the kinds {', '.join(KINDS)} is named")
-    workers = Workers(args.jobs, modules=("control_planners",))
+    workers = Workers(args.jobs)
     results = bench(
         levels, ROWS, head_to_head.FOLDER, runs=args.n, timeout=head_to_head.TIMEOUT, workers=workers,
         keep=True, provenance=record.session(),

@@ -83,7 +83,7 @@ def main() -> None:
     if not 0 <= args.first <= FROZEN - args.n or not set(args.levels) <= set(VALIDATION[SUITE]):
         parser.error(f"expected --first and -n of {FROZEN} at most together, levels {', '.join(VALIDATION[SUITE])}")
     levels = [f"{SUITE}/{level}" for level in args.levels or VALIDATION[SUITE]]
-    wanted, workers = rows(args.rows, args.model), Workers(args.jobs, modules=("control_planners",))
+    wanted, workers = rows(args.rows, args.model), Workers(args.jobs, modules=("benchmarks.lib.control_planners",))
     if not args.report:
         bench(
             levels, wanted, args.store, runs=args.n, first=args.first, timeout=TIMEOUT, split="validation",
