@@ -35,7 +35,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.timing import Timing, time_path
 
 KINDS = [POSITION, AXIS, ROTATION]
-EVERYTHING = 1e3  # tolerance that all intervals keep, bounds near what is found among them [m, rad]
+EVERYTHING = [100.0, 20.0, 20.0]  # tolerances that every interval keeps, near what is found in its middle
 WORLD = JointFrame(0, np.eye(3), np.zeros(3))
 SHARES = np.linspace(0.0, 1.0, 21)
 
