@@ -158,7 +158,7 @@ def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | Non
 def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Held) -> Candidate | None:
     representation = draw_representation(rng)
     margin = MARGIN + ROUNDING + representation.swelling
-    scene = _composition(rng, suite, grammar)
+    scene = composition(rng, suite, grammar)
     way = rng.random()
     if suite == SUITE and way < ALIGNED:
         held, ends = _aligned(rng)
@@ -170,17 +170,17 @@ def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Hel
         return None
     palms = palm_line(held.tables.both, ends, 9).reshape(-1, 3)
     if way < ALIGNED + MET:
-        scene = _in_the_way(rng, scene, palms)
+        scene = in_the_way(rng, scene, palms)
     parts = scene.parts
     if rng.random() < SPRINKLED:
         for _ in range(int(rng.integers(1, MOST_LOOSE + 1))):
             center = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, 0.18, 3)
             parts = [*parts, *place(solid(rng, 0.015, 0.2), shift(*center))]
-    parts = clear_parts(held.tables.both, _near(parts)[:MOST_OBSTACLES], ends, margin)
+    parts = clear_parts(held.tables.both, near(parts)[:MOST_OBSTACLES], ends, margin)
     return Candidate(parts, ends, held, representation)
 
 
-def _composition(rng: np.random.Generator, suite: str, grammar: Grammar) -> Composition:
+def composition(rng: np.random.Generator, suite: str, grammar: Grammar) -> Composition:
     """Return a composition at its site, with its mirror image or another one beside it."""
     bare = grammar(rng)
     first = bare.placed(site(rng, bare))
@@ -211,7 +211,7 @@ def _aligned(rng: np.random.Generator) -> tuple[Held, Array | None]:
     return held, None if drawn is None else np.stack([drawn.start, drawn.goal])
 
 
-def _in_the_way(rng: np.random.Generator, scene: Composition, palms: Array) -> Composition:
+def in_the_way(rng: np.random.Generator, scene: Composition, palms: Array) -> Composition:
     """Return a composition moved so that one of its places, or of its parts, is where a palm passes."""
     one = scene.places[int(rng.integers(len(scene.places)))]
     center = one.point if rng.random() < 0.5 else scene.parts[int(rng.integers(len(scene.parts)))].pose[:3, 3]
@@ -219,7 +219,7 @@ def _in_the_way(rng: np.random.Generator, scene: Composition, palms: Array) -> C
     return scene.placed(shift(*to) @ turn("z", rng.normal(0.0, 0.3)) @ shift(*-center))
 
 
-def _near(parts: Parts) -> Parts:
+def near(parts: Parts) -> Parts:
     """Return those parts that are in the workspace, at least in part."""
     if not parts:
         return parts

@@ -13,7 +13,7 @@ import numpy as np
 
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.goals.state_sampling import HandPoseSampler
-from apex_ompl.problems import ID, alignment, broad, scenes
+from apex_ompl.problems import ID, alignment, broad, constrained, scenes
 from apex_ompl.problems.broad import GRAMMARS, SUITE
 from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, empty_hand_tables, robot
 from apex_ompl.scene.problem import Problem
@@ -35,7 +35,15 @@ VALIDATION = {broad.UNSEEN: broad.LEVELS[broad.UNSEEN]}
 """Suite for validation only -> its levels; none of its problems is drawn for training."""
 
 KNOWN = {**LEVELS, **TRAINING, **VALIDATION}
-"""Every suite -> its levels."""
+"""Every suite -> its levels without constraints."""
+
+CONSTRAINED = constrained.LEVELS
+"""Suite -> its levels with constraints; those of ``unseen`` are for validation only."""
+
+
+def levels_of(suite: str) -> tuple[str, ...]:
+    """Return all levels of a suite, those with constraints included."""
+    return (*KNOWN[suite], *CONSTRAINED.get(suite, ()))
 
 
 @dataclass(frozen=True)
@@ -61,7 +69,7 @@ class ProblemId:
                 is for validation alone.
         """
         check_name(self.suite, "suite", KNOWN)
-        check_name(self.level, f"level of {self.suite}", KNOWN[self.suite])
+        check_name(self.level, f"level of {self.suite}", levels_of(self.suite))
         is_integer = isinstance(self.seed, (int, np.integer)) and not isinstance(self.seed, bool)
         if not is_integer or not 0 <= self.seed < SPLITS["test"].stop:
             raise ParameterError("seed", self.seed, f"a whole number from 0 to {SPLITS['test'].stop - 1}")
@@ -105,6 +113,8 @@ def draw(problem_id: ProblemId, number: int) -> DrawnProblem | None:
     """Return draw ``number`` of a problem, or None when that draw has no start or no goal."""
     level_hash = zlib.crc32(f"{problem_id.suite}/{problem_id.level}".encode())
     rng = np.random.default_rng([level_hash, problem_id.seed, number])
+    if problem_id.level in CONSTRAINED.get(problem_id.suite, ()):
+        return constrained.draw(rng, problem_id.suite, problem_id.level, problem_id.seed)
     if problem_id.suite in alignment.SAMPLERS:
         return alignment.draw(rng, problem_id.suite, problem_id.level)
     if problem_id.suite == SUITE and problem_id.level in broad.SIMPLE_LEVELS:

@@ -96,7 +96,8 @@ class FrozenProblem:
 def is_frozen(problem_id: ProblemId) -> bool:
     """Whether a problem is among the frozen ones."""
     seeds = (frozen_seeds(problem_id.suite, problem_id.level, split) for split in COUNTS)
-    return problem_id.suite in FROZEN and any(problem_id.seed in some for some in seeds)
+    known = problem_id.level in FROZEN.get(problem_id.suite, ())
+    return known and any(problem_id.seed in some for some in seeds)
 
 
 def frozen_seeds(suite: str, level: str, split: str) -> range:

@@ -9,6 +9,7 @@ from apex_ompl.goals.state_sampling import DualArmTables
 from apex_ompl.problems.broad_representation import Group, given
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.constraints import AnyConstraint
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.types import Array
 
@@ -37,6 +38,7 @@ class DrawnProblem:
         goal: Shape (dof,).
         attached: Held objects.
         groups: Obstacles, by their index in ``scene``, that are given as a mesh or as points.
+        constraints: What holds along a path, beside the chains that objects in two hands close.
     """
 
     scene: tuple[Obstacle, ...]
@@ -44,11 +46,12 @@ class DrawnProblem:
     goal: Array
     attached: tuple[AttachedObject, ...] = ()
     groups: tuple[Group, ...] = ()
+    constraints: tuple[AnyConstraint, ...] = ()
 
     def to_problem(self, name: str, robot: Robot) -> Problem:
         """Return the problem under a name, for the robot that it was drawn for."""
         start, goal = (dict(zip(robot.joint_names, q.tolist(), strict=True)) for q in (self.start, self.goal))
         return Problem(
             name=name, robot=robot.name, scene=given(self.scene, self.groups), attached=self.attached, start=start,
-            goal=Goal(joints=(goal,)),
+            goal=Goal(joints=(goal,)), constraints=self.constraints,
         )  # fmt: skip

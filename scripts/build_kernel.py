@@ -160,9 +160,9 @@ def check(code: dict[str, str], file: Path) -> None:
 
 def compile_all(machine: str) -> list[Built]:
     """Compile all functions, those that call the same ones in one process."""
-    from apex_ompl.kernel.compiled.entry_points import OTHERS, PLANS, RUNS
+    from apex_ompl.kernel.compiled.entry_points import CONSTRAINED, OTHERS, PLANS, RUNS
 
-    parts = [list(part) for group in (PLANS, RUNS) for part in group.parts] + [list(OTHERS)]
+    parts = [list(part) for group in (PLANS, RUNS, CONSTRAINED) for part in group.parts] + [list(OTHERS)]
     os.environ[library.CHOICE] = "numba"
     with ProcessPoolExecutor(len(usable_cores()), get_context("spawn")) as pool:
         tasks = [pool.submit(compile_some, machine, part) for part in parts]

@@ -1,9 +1,10 @@
 """Find and check the ready-made problems and the example for Baxter, and write their files.
 
 Reaching problems give poses of both hands at start and goal; alignment problems give objects in the hands and
-how they are to meet. States are found by inverse kinematics from seeded random states. A problem is kept when its
-start (and goal) is free with a clearance of 1 cm, no straight line to a goal is free for seed 0, and rrtconnect finds a
-path that passes the full check for three seeds.
+how they are to meet; carry problems give the places of a level tray or of upright cups. States are found by inverse
+kinematics from seeded random states. A problem is kept when its start (and goal) is free with a clearance of 1 cm, no
+straight line to a goal is free for seed 0, and rrtconnect, or apex under constraints, finds a path that passes the full
+check for three seeds.
 
 Usage: python scripts/find_problems.py [NAME ...]
 """
@@ -11,20 +12,32 @@ Usage: python scripts/find_problems.py [NAME ...]
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from ready_made.meshes import block_obj, cup_obj
-from ready_made.specifications import SPECIFICATIONS, AlignmentSpecification, HandPose, ReachSpecification
+from ready_made.specifications import (
+    SPECIFICATIONS,
+    AlignmentSpecification,
+    CarrySpecification,
+    HandPose,
+    ReachSpecification,
+)
 
 from apex_ompl.api import plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.goals.grasp import HandObjects, close_hands
+from apex_ompl.goals.state_sampling import scene_kernel
 from apex_ompl.kernel import offset_target, opposition_target
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
+from apex_ompl.problems.broad_parts import shift
+from apex_ompl.problems.constrained_ends import PalmSampler, line_is_free, palms_at, palms_with_cups
+from apex_ompl.problems.constrained_held import TraySize, carried_tray, held_cups
 from apex_ompl.problems.objects import DATA
+from apex_ompl.problems.suite_robot import DrawnProblem
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import Goal, Problem
@@ -136,6 +149,34 @@ def find_alignment(specification: AlignmentSpecification) -> Problem:
     raise SystemExit("no start will do")
 
 
+def find_carried(specification: CarrySpecification) -> Problem:
+    """Return the problem of a carry specification; of pairs of states the nearest whose straight line collides."""
+    robot, scene, name = load_robot("dual_panda_softhand"), tuple(specification.scene()), Path(specification.file).stem
+    has_tray = len(specification.start) == 1
+    carried = carried_tray(TraySize(0.2, 0.26, 0.6), loaded=True) if has_tray else held_cups()
+    tables = scene_kernel(robot, carried.held.tables.both, scene).scene
+    sampler, rng = PalmSampler(carried, tables, MARGIN), np.random.default_rng(specification.seed)
+
+    def states(points: Sequence[tuple[float, float, float]], yaws: tuple[float, float], near: np.ndarray | None = None):
+        if has_tray:
+            return sampler.sample(rng, palms_at(carried, shift(*points[0])), near)
+        return sampler.sample(rng, palms_with_cups([np.array(point) for point in points], yaws), near)
+
+    for start in states(specification.start, specification.yaws[0]):
+        goals = states(specification.goal, specification.yaws[1], start)
+        print(f"  {len(goals)} goals")
+        for goal in sorted(goals, key=lambda q: float(np.abs(q - start).max())):
+            if line_is_free(carried, tables, np.stack([start, goal])):
+                continue
+            problem = DrawnProblem(scene, start, goal, carried.held.attached, (), carried.constraints)
+            found = problem.to_problem(name, robot)
+            results = [plan(found, timeout=10.0, seed=seed) for seed in range(3)]
+            print("  " + ", ".join(f"{r.status} {r.times['total']:.2f} s {r.reason}" for r in results), flush=True)
+            if all(results):
+                return found
+    raise SystemExit("no pair of start and goal will do")
+
+
 def with_relative_meshes(problem: Problem) -> Problem:
     """Return the problem with its meshes named from the folder of the file."""
 
@@ -145,6 +186,14 @@ def with_relative_meshes(problem: Problem) -> Problem:
         return body.model_copy(update={"mesh": body.mesh.model_copy(update={"file": Path(body.mesh.file).name})})
 
     return problem.model_copy(update={"attached": tuple(moved(body) for body in problem.attached)})
+
+
+def _found(specification: ReachSpecification | AlignmentSpecification | CarrySpecification) -> Problem:
+    if isinstance(specification, CarrySpecification):
+        return find_carried(specification)
+    if isinstance(specification, ReachSpecification):
+        return find_reach(specification)
+    return find_alignment(specification)
 
 
 def main() -> None:
@@ -158,8 +207,7 @@ def main() -> None:
         name = Path(specification.file).stem
         if not names or name in names:
             print(name, flush=True)
-            is_reach = isinstance(specification, ReachSpecification)
-            problem = find_reach(specification) if is_reach else find_alignment(specification)
+            problem = _found(specification)
             with_relative_meshes(problem).save(ROOT / specification.file)
 
 

@@ -59,7 +59,8 @@ class ApexParameters(Parameters):
         polish: Whether valid paths are shortened.
         approximate: Whether, without an exact solution, a path that ends near a goal is given as an approximate one.
         anytime: Whether paths are improved until the time is up, or until they satisfy the path length objective, where
-            there is one. An objective alone does not ask for it: OMPL's optimizing planners leave one in the problem.
+            there is one; ``plan`` improves the motion in their place, unless its objective is ``length``. An OMPL
+            objective alone does not ask for it: OMPL's optimizing planners leave one in the problem.
         range: Longest step of RRTConnect's trees in sprints, in bridges and as fallback, by default the tuned one; 0
             lets OMPL choose.
         seed: Of the proposals' noise; -1 takes one that follows from OMPL's.

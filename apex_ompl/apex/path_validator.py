@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ompl import base as ob
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.constrained_space import constraint_of, refuse_constraints
@@ -19,6 +18,9 @@ from apex_ompl.ompl.space import ambient_space, bounds_of, require_real_vectors,
 from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker, forwarding
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.types import Array, Flags
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 Stop = Callable[[], bool]
 NOT_ACCEPTED = "the state validity checker that is set does not accept the path"

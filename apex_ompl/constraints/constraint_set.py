@@ -20,6 +20,7 @@ from apex_ompl.constraints.links import Links
 from apex_ompl.constraints.user import UserConstraint, check_user_constraint
 from apex_ompl.errors import ConstraintError
 from apex_ompl.kernel.constraints import AXIS, POSITION, ROTATION, ConstraintGroup, ConstraintRows, JointFrame
+from apex_ompl.kernel.library import compile_for_constraints
 from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
@@ -152,6 +153,7 @@ class ConstraintSet:
             ConstraintError: No planned joint moves the frames of a constraint against each other.
             ParameterError: A constraint is neither a record nor one of a user's own that can be used.
         """
+        compile_for_constraints()
         state = np.clip(np.asarray(start, float), robot.limits.lower, robot.limits.upper)  # as plans clip it
         tables = _Tables(robot, attached, state)
         members = [tables.member(one) if isinstance(one, Constraint) else _of_user(one, state) for one in constraints]

@@ -12,11 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled.arrays import FIXED
-from apex_ompl.kernel.compiled.constraint import path_optimization, projection, proof, search
+from apex_ompl.kernel.compiled.constraint import duration, path_optimization, projection, proof, search
 from apex_ompl.kernel.compiled.constraint.rows import AXIS, POSITION, ROTATION, ConstraintArrays, RowBuffers
 from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.path.path_cost import CostSettings, PathReport
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
+from apex_ompl.kernel.duration import DurationReport, DurationSettings, TimeGrid, duration_buffers
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.path import PathGrid
 from apex_ompl.kernel.search import SearchBuffers, SearchCounts, TreePair
@@ -35,6 +36,7 @@ __all__ = [
     "ConstraintRows",
     "JointFrame",
     "ManifoldConnection",
+    "lower_constrained_duration",
     "optimize_constrained_path",
     "prove_motion",
     "prove_path",
@@ -44,7 +46,7 @@ MOST_ROWS = {POSITION: 3, AXIS: 2, ROTATION: 3}
 LONGEST, PIECES = 0.15, 2  # of an edge of trees [rad], and its chords
 MOST_EDGES = 200  # of a connection
 AT_ONCE = 8  # random states between two looks at the clock
-ORTHOGONAL = 1e-6
+ORTHOGONAL = 1e-12
 
 
 class JointFrame(NamedTuple):
@@ -268,6 +270,33 @@ def optimize_constrained_path(
             *rows.buffers(),
         )  # fmt: skip
     )
+
+
+def lower_constrained_duration(
+    kernel: Kernel, rows: ConstraintRows, grid: TimeGrid, limits: Array, pinned: int, control: Array, spacing: float,
+    settings: DurationSettings, weight: float, share: float = 1.0,
+) -> DurationReport:  # fmt: skip
+    """Lower the objective of a motion from rest to rest in place, with a penalty on rows of constraints at its samples.
+
+    Args:
+        kernel: The robot among its obstacles.
+        rows: The constraints.
+        grid: Samples of the motion.
+        limits: Limits of velocity, acceleration and jerk, shape (3, dof); 0 for joints that stay.
+        pinned: Number of control points at each end that stay.
+        control: Control points, shape (P, dof), inside the position limits.
+        spacing: Knot spacing, with which the motion is inside all limits [s].
+        settings: Objective, margin and steps.
+        weight: Weight of half the square of a row [1/m^2, 1/rad^2].
+        share: Factor on dead zones.
+    """
+    return DurationReport(
+        *duration.lower_constrained_duration(
+            *kernel.packed, *kernel.workspace(), *grid, limits, pinned, float(spacing), control, tuple(settings),
+            *duration_buffers(grid, control, pinned), *rows.packed, float(weight), float(share), rows.rows,
+            *rows.buffers(),
+        )
+    )  # fmt: skip
 
 
 class ConstrainedTreePair(TreePair):

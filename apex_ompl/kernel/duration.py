@@ -65,6 +65,12 @@ class DurationReport(NamedTuple):
     steps: int
 
 
+def duration_buffers(grid: TimeGrid, control: Array, pinned: int) -> tuple[Integers, Array]:
+    """Return memory for the steps on control points, shape (P, dof), of which some are pinned at each end."""
+    integers, floats = compiled.duration_buffer_sizes(len(control), pinned, control.shape[1], len(grid.weights))
+    return np.empty(integers, np.int64), np.empty(floats)
+
+
 def lower_duration(
     kernel: Kernel, grid: TimeGrid, limits: Array, pinned: int, control: Array, spacing: float,
     settings: DurationSettings,
@@ -80,11 +86,9 @@ def lower_duration(
         spacing: Knot spacing, with which the motion is inside all limits [s].
         settings: Objective, margin and steps.
     """
-    points, dof = control.shape
-    integers, floats = compiled.duration_buffer_sizes(points, pinned, dof, len(grid.weights))
     return DurationReport(
         *compiled.lower_duration(
             *kernel.packed, *kernel.workspace(), *grid, limits, pinned, float(spacing), control, tuple(settings),
-            np.empty(integers, np.int64), np.empty(floats),
+            *duration_buffers(grid, control, pinned),
         )
     )  # fmt: skip

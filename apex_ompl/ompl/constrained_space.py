@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.errors import ConstraintError, ParameterError
 from apex_ompl.ompl.space import to_array
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 RANGE = 0.5  # of trees on the manifold where none is given [rad]
 DELTA = 0.4  # step of OMPL's interpolation on the manifold [rad]

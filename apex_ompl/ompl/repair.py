@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from typing import TYPE_CHECKING
 
 import numpy as np
 from ompl import base as ob
@@ -12,8 +13,6 @@ from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.paths import ConstrainedPaths
 from apex_ompl.ompl.process import Interrupt, ends_after
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.simple_setup import SimpleSetup
@@ -31,6 +30,9 @@ from apex_ompl.ompl.validity import (
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import Path, path_length
 from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 ROUNDS = 6
 MIN_GAIN = 0.01  # a round that shortens by less than this share is the last
@@ -86,6 +88,8 @@ def exact_paths(
         rng: Source of shortcuts, whose path comes first; None for no shortcuts.
         stop: Asked whether to end shortcuts.
     """
+    from apex_ompl.constraints.paths import ConstrainedPaths
+
     paths = ConstrainedPaths(checker.kernel, constraints, Optimizer(), lambda states: True, stop)
     several = [nodes]
     if rng is not None and not constraints.user:

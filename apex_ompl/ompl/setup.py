@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 from weakref import ref
 
 import numpy as np
@@ -12,8 +13,6 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.user import UserConstraint
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.goal_sampling import sample, sample_on_constraints
 from apex_ompl.goals.pose_goal import PoseGoal
@@ -27,6 +26,10 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.user import UserConstraint
 
 GOAL_STATES = 8  # how many states an alignment goal is sampled into
 GOAL_ATTEMPTS = 200
@@ -212,6 +215,8 @@ def constraint_set(
     """
     if not (problem.constraints or constraints or any(one.links is not None for one in problem.attached)):
         return None
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+
     hands = (hand.synergy for hand in robot.hands.values() if hand.synergy is not None)
     fixed = sorted({*held.tolist(), *(robot.joint_names.index(name) for name in hands)})
     return ConstraintSet.of(robot, (*problem.constraints, *constraints), problem.attached, start, fixed)

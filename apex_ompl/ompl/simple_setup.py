@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.ompl.constrained_space import constraint_of, projected_space
 from apex_ompl.ompl.process import ends_after
 from apex_ompl.ompl.space import Bounds, await_goal, state_space
 from apex_ompl.robot import Robot
 from apex_ompl.util.process import running
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 
 class SpaceInformation(ob.SpaceInformation):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 import numpy as np
@@ -15,8 +15,6 @@ from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.path_proof import Curve, PathProof
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.proof import ConstraintCertificate, prove_motion, prove_path
 from apex_ompl.ompl.simple_setup import RobotSpaceInformation
 from apex_ompl.ompl.space import to_array, to_state
 from apex_ompl.paths.path import SEARCH_RESOLUTION
@@ -24,6 +22,10 @@ from apex_ompl.timing.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_states, number_array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.proof import ConstraintCertificate
 
 JUMP = 2.0  # largest distance of neighboring states of a motion on constraints, in units of that on the straight line
 
@@ -309,6 +311,8 @@ def full_check(
         return FullCheck(False, "not proved in time", None, timed_out=True)
     kept: ConstraintCertificate | None = None
     if constraints is not None:
+        from apex_ompl.constraints.proof import prove_motion, prove_path
+
         kept = prove_path(constraints, states) if motion is None else prove_motion(constraints, motion)
         if not kept:
             return FullCheck(False, kept.fault, None, constraints=kept)

@@ -1,7 +1,8 @@
 """The motion of a plan: duration or calm as the objective, proved along its own curve.
 
 The motion starts from the path that was found. Where it ends at one of several goals, straight motions to others that
-could be reached sooner are tried, too, and other paths where it takes a detour in time.
+could be reached sooner are tried, too, and other paths where it takes a detour in time. An anytime plan goes on with
+other paths and goals (:mod:`apex_ompl.planning.anytime`).
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.errors import TimingError
-from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
+from apex_ompl.kernel.search import RESOLUTION, TreePair, shortcut
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import FullCheck, MotionValidator, StateValidityChecker, full_check
 from apex_ompl.paths.path import SEARCH_RESOLUTION, Path
+from apex_ompl.planning.anytime import TREE_RANGE, OtherPaths, tree_path
 from apex_ompl.robot.model import Limits
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing import MotionLimits, TimedPath, Timing, Trajectory
@@ -40,7 +42,9 @@ SOONER = 0.95  # share of the duration that the lower bound of another goal must
 STATES_PER_KNOT = 2, 4, 8  # of the path along a motion; the first that passes the full check
 DETOUR, WAYS = 1.15, 2  # ratio of a duration to the direct one, beyond which so many other paths are tried
 AS_SOON = 0.99  # share of the duration that these must not reach
-TREE_RANGE, ITERATIONS = 1.5, 6_000  # longest step of their trees [rad], and most iterations
+SLIGHTLY = 0.998  # the same of an anytime plan
+ROUNDED = 1e-6  # to whole nanoseconds of each span [s]
+LAST = 0.05  # time of such a plan in which no further path is tried [s]
 SHARE = 0.5  # of the time left
 FITTED = 0.02  # largest deviation of a motion that is timed anew for limits of torques and tool speeds [rad]
 
@@ -90,6 +94,8 @@ def optimized_motion(
 ) -> ProvedMotion | None:
     """Return a motion by the query's objective, or None where none is proved in time.
 
+    Where the query improves its motion, this takes all of its time but for a little; half of it until one is proved.
+
     Args:
         query: The query.
         path: A valid path.
@@ -101,29 +107,47 @@ def optimized_motion(
     limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
     held = np.zeros(setup.robot.dof, bool)
     held[setup.held] = True
-    optimizer = DurationOptimizer(setup.checker.kernel, limits, held)
+    rows = None if setup.constraints is None else setup.constraints.rows
+    optimizer = DurationOptimizer(setup.checker.kernel, limits, held, rows)
     reserve = query.deadline.remaining * (1.0 - SHARE)
 
     def stop() -> bool:
         return query.ends() or query.deadline.remaining < reserve
 
-    search = _Search(optimizer, timing.method, check, stop)
+    search = _Search(query, timing, limits, more, optimizer, check, stop)
     found = search.proved(optimizer.fastest(path.states, stop))
     if found is None:
         found = search.proved(optimizer.fastest(path.states, stop, narrow=True))
     for goal, least in _other_goals(setup, path, limits):
         if found is not None and least >= SOONER * found.spline.duration:
             break
-        found = search.sooner(found, np.stack([setup.start, goal]), SOONER)
+        found = search.sooner(np.stack([setup.start, goal]), _share(SOONER, found)) or found
     for other in _other_ways(setup, path, found, limits, stop):
-        found = search.sooner(found, other, AS_SOON)
-    if found is not None:
-        calm = query.objective == "calm"
-        found = search.lasting(
-            found, max((query.calm_factor if calm else 1.0) * found.spline.duration, timing.minimum_duration), calm
-        )
-    timed = None if found is None else _kept(search, found, limits, timing, more)
-    return None if timed is None else _with_path(setup, *timed)
+        found = search.sooner(other, _share(AS_SOON, found)) or found
+    made = None if found is None else search.finished(found)
+    if query.improves_motion and made is not None:
+        search = search._replace(stop=lambda: query.ends() or query.deadline.remaining < LAST)
+    return _improved(search, made) if query.improves_motion else made
+
+
+def _improved(search: _Search, made: ProvedMotion | None) -> ProvedMotion | None:
+    """Return the fastest of a motion and of those from other paths, each of which is to undercut it."""
+    others = OtherPaths(search.query, search.limits, search.stop)
+
+    def keep(motion: ProvedMotion) -> ProvedMotion:
+        others.best = motion.timed.trajectory
+        others.most = SLIGHTLY * others.best.duration / search.factor
+        return motion
+
+    made = None if made is None else keep(made)
+    for path in others.paths():
+        if others.best is not None and others.best.duration <= search.timing.minimum_duration + ROUNDED:
+            break
+        found = search.sooner(path, others.most)
+        better = None if found is None else search.finished(found)
+        if better is not None and better.timed.trajectory.duration < search.factor * others.most:
+            made = keep(better)
+    return made
 
 
 class _Proved(NamedTuple):
@@ -134,13 +158,26 @@ class _Proved(NamedTuple):
     proof: PathProof
 
 
+def _share(share: float, found: _Proved | None) -> float:
+    """Return a share of the duration of a motion; infinite without one [s]."""
+    return np.inf if found is None else share * found.spline.duration
+
+
 class _Search(NamedTuple):
     """Proves motions, and repairs those that are not."""
 
+    query: PlanQuery
+    timing: Timing
+    limits: Limits
+    more: MotionLimits | None
     optimizer: DurationOptimizer
-    method: str
     check: Check
     stop: Callable[[], bool]
+
+    @property
+    def factor(self) -> float:
+        """Duration of the motion that is asked for, as a multiple of the fastest one's."""
+        return self.query.calm_factor if self.query.objective == "calm" else 1.0
 
     def proved(self, spline: TimedSpline | None, repairs: int = REPAIRS) -> _Proved | None:
         """Return a motion that passed the full check, or None."""
@@ -155,47 +192,52 @@ class _Search(NamedTuple):
                 spline = self.optimizer.cleared(spline, turn)
         return None
 
-    def sooner(self, found: _Proved | None, states: Array, share: float) -> _Proved | None:
-        """Return the motion from another path, shape (N, dof), where it takes less than a share of the time."""
-        most = np.inf if found is None else share * found.spline.duration
-        other = None if self.stop() else self.proved(self.optimizer.fastest(states, self.stop, most), repairs=1)
-        return found if other is None or other.spline.duration >= most else other
+    def sooner(self, states: Array, most: float) -> _Proved | None:
+        """Return the motion from another path, shape (N, dof), where it undercuts a duration [s]."""
+        spline = None if self.stop() else self.optimizer.fastest(states, self.stop, most)
+        found = None if spline is None or spline.duration >= most else self.proved(spline, repairs=1)
+        return None if found is None or found.spline.duration >= most else found
 
-    def lasting(self, found: _Proved, duration: float, calm: bool) -> _Proved | None:
-        """Return a motion of a longer duration [s]: a calm one if asked and proved, else along the same curve."""
+    def finished(self, found: _Proved) -> ProvedMotion | None:
+        """Return a motion as it is asked for, within all limits and with the path along it, or None."""
+        lasting = self._lasting(found)
+        timed = None if lasting is None else self._kept(lasting)
+        return None if timed is None else _with_path(self.query.setup, *timed)
+
+    def _lasting(self, found: _Proved) -> _Proved | None:
+        """Return a motion of the duration asked for: a calm one if asked and proved, or along the same curve."""
+        duration = max(self.factor * found.spline.duration, self.timing.minimum_duration)
         if duration <= found.spline.duration:
             return found
         slower = found.spline.lasting(whole_nanoseconds(duration / found.spline.spans))
-        made = self.proved(self.optimizer.calmest(slower), repairs=0) if calm and not self.stop() else None
+        calm = self.query.objective == "calm" and not self.stop()
+        made = self.proved(self.optimizer.calmest(slower), repairs=0) if calm else None
         return made or self.proved(slower, repairs=0)
+
+    def _kept(self, found: _Proved) -> tuple[TimedPath, PathProof] | None:
+        """Return the motion within limits of torques and tool speeds, and its certificate, or None."""
+        motion, more = found.timed.trajectory, self.more
+        if more is None or more.stretch(motion) == 1.0:
+            return found.timed, found.proof
+        try:
+            near = replace(self.timing, deviation=min(self.timing.deviation, FITTED))
+            faster = fitted(motion, self.limits, more, near, stop=self.stop)
+        except TimingError:  # gravity overloads it
+            return None
+        slower = replace(found.timed, trajectory=motion.slower(more.stretch(motion)).merged())
+        for candidate in (faster, slower):
+            checked = self.check(candidate.trajectory)
+            if checked and checked.proof is not None:
+                return replace(candidate, deviation=0.0), checked.proof
+        return None
 
     def _timed(self, spline: TimedSpline) -> TimedPath | None:
         """Return the motion of a spline by the method."""
         motion = spline.trajectory(self.optimizer.kernel.robot.joint_names)
-        if self.method != "ruckig":
-            return TimedPath(motion, 0.0, self.method, OPTIMIZED)
+        if self.timing.method != "ruckig":
+            return TimedPath(motion, 0.0, self.timing.method, OPTIMIZED)
         made = calm_motion(motion, self.optimizer.limits, self.stop)
         return None if made is None else TimedPath(made.trajectory, 0.0, made.method, OPTIMIZED)
-
-
-def _kept(
-    search: _Search, found: _Proved, limits: Limits, timing: Timing, more: MotionLimits | None
-) -> tuple[TimedPath, PathProof] | None:
-    """Return the motion within limits of torques and tool speeds, and its certificate, or None where none is proved."""
-    motion = found.timed.trajectory
-    if more is None or more.stretch(motion) == 1.0:
-        return found.timed, found.proof
-    try:
-        near = replace(timing, deviation=min(timing.deviation, FITTED))
-        faster = fitted(motion, limits, more, near, stop=search.stop)
-    except TimingError:  # gravity overloads it
-        return None
-    slower = replace(found.timed, trajectory=motion.slower(more.stretch(motion)).merged())
-    for candidate in (faster, slower):
-        checked = search.check(candidate.trajectory)
-        if checked and checked.proof is not None:
-            return replace(candidate, deviation=0.0), checked.proof
-    return None
 
 
 def _other_goals(setup: PlanningSetup, path: Path, limits: Limits) -> list[tuple[Array, float]]:
@@ -214,14 +256,15 @@ def _other_ways(
     durations = direct_durations(setup.start, goals, limits)
     most = np.inf if found is None else found.spline.duration / DETOUR
     goals = goals[durations < most][: GOALS + 1]
+    if setup.constraints is not None:  # the planner has tried others
+        return
     kernel, rng = setup.checker.kernel.within(*setup.bounds), np.random.default_rng([setup.seed, WAYS])
     for one in rng.spawn(WAYS) if len(goals) else ():
         if stop():
             return
-        trees = TreePair(kernel, setup.start[None], goals, TREE_RANGE, SEARCH_RESOLUTION, one)
-        way = trees.grow(ITERATIONS, stop)
+        way = tree_path(kernel, setup.start, goals, one, stop)
         if way is not None:
-            yield shortcut(kernel, way, ENOUGH, RESOLUTION, one.spawn(1)[0], stop)[0]
+            yield way
 
 
 def _with_path(setup: PlanningSetup, timed: TimedPath, proof: PathProof) -> ProvedMotion | None:
@@ -231,7 +274,7 @@ def _with_path(setup: PlanningSetup, timed: TimedPath, proof: PathProof) -> Prov
         states = motion(np.linspace(0.0, motion.duration, count * (len(motion.times) - 1) + 1))
         states[:, setup.held] = setup.start[setup.held]
         states[0], states[-1] = motion.positions[0], motion.positions[-1]
-        checked = full_check(setup.checker, states, setup.start, setup.goals)
+        checked = full_check(setup.checker, states, setup.start, setup.goals, constraints=setup.constraints)
         if checked and checked.proof is not None:
             return ProvedMotion(timed, Path(states), proof, checked.proof)
     return None

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from apex_ompl.collision import CollisionChecker, Contact
     from apex_ompl.constraints.user import UserConstraint
     from apex_ompl.planners import AnyPlanner
+    from apex_ompl.planning.lines import LineResult, Waypoint
     from apex_ompl.planning.query import Group, State, Target
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
@@ -284,6 +285,7 @@ class MotionPlanner:
             parameters = planners.chosen(
                 NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
             )
+            derivatives = None
             if timing is not None:
                 derivatives = timing.start(timing.limits(robot.limits, robot.joint_names))  # checked before planning
                 timing.motion_limits(robot, problem.attached, problem.payload)  # checked before planning
@@ -306,7 +308,8 @@ class MotionPlanner:
             times = {"setup": time.perf_counter() - started}
             query = steps.check(
                 setup, parameters, timeout=options.timeout, objective=options.objective,
-                calm_factor=options.calm_factor, started=started, times=times, notes=notes,
+                calm_factor=options.calm_factor, timing=timing is not None and not dynamic and derivatives is None,
+                started=started, times=times, notes=notes,
             )  # fmt: skip
             preparing.close()
             with Interrupt() as query.interrupt, running(query.interrupt.end):
@@ -319,6 +322,57 @@ class MotionPlanner:
             if departure is not None:
                 result = steps.finish(query, with_departure(result, given, departure, timing))
             return result
+
+    def plan_line(
+        self, start: State, pose: Waypoint | Sequence[Waypoint], *, frame: str | None = None,
+        speed: float | None = None, blend: float = 0.0, timeout: float = 5.0, timing: bool | Timing = True,
+        name: str = "line",
+    ) -> LineResult:  # fmt: skip
+        """Plan a motion along which frames go straight from pose to pose, in the world as it is now.
+
+        Position and orientation go in step, the latter by the shortest turn, within 0.1 mm and 0.1 degrees at all
+        times; other joints stay. Where the frames cannot reach the last pose, the result says how far they get, and
+        why. They stop at poses in between unless there are blends. See `docs/straight_lines.md`.
+
+        Args:
+            start: The start.
+            pose: A pose or several: a ``PoseTarget``; a rigid transform, shape (4, 4); a position, shape (3,), with the
+                orientation as before; or poses by frame, for two arms at once [m].
+            frame: Hand, link or held object, where the poses do not name it.
+            speed: Largest speed of the frames [m/s].
+            blend: Radius around the poses in between inside of which the frames may leave the lines, at most half of
+                the segments beside them [m].
+            timeout: Seconds for the plan.
+            timing: How the path is timed, or whether; from rest to rest.
+            name: Name of the problem in the result.
+
+        Raises:
+            ApexError: The start, a pose, a frame, or an option is faulty.
+            KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
+        """
+        from apex_ompl.collision.conservative import CheckCounts
+        from apex_ompl.ompl.process import Interrupt
+        from apex_ompl.planning import lines
+        from apex_ompl.planning.query import state_array
+        from apex_ompl.timing.parameterization import warm_up
+        from apex_ompl.util.clocks import Deadline
+
+        check_arguments(timeout, 0)
+        with running(), self._lock:
+            with unforked():
+                changing = [obstacle.name for obstacle in self._checker.changing_obstacles if obstacle.moving]
+                if changing:
+                    raise ParameterError("world", f"the moving obstacle {changing[0]!r}", "obstacles that stand still")
+                checker = self._checker_without(self._absent())
+                checker.check_counts = CheckCounts()
+                query = lines.line_query(
+                    checker, state_array(self.robot, start, "start"), pose, frame=frame, blend=blend, speed=speed,
+                    timing=timing, problem=lambda goals: self.problem(start, goals, name),
+                )  # fmt: skip
+                warm_up()
+            deadline = Deadline(timeout)
+            with Interrupt() as interrupt, running(interrupt.end):
+                return lines.plan_along(checker, query, deadline, lambda: interrupt.pressed or deadline.expired)
 
     def problem(
         self, start: State, goal: Target, name: str = "world", group: Group | None = None, seed: int = 0

@@ -19,18 +19,15 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import nan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ompl import base as ob
 
 from apex_ompl import planners
-from apex_ompl.apex.parameters import NAME
+from apex_ompl.apex.parameters import NAME, ApexParameters
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.proof import ConstraintCertificate
-from apex_ompl.constraints.user import UserConstraint
 from apex_ompl.errors import ApexError, ParameterError, TimingError, TimingStoppedError
 from apex_ompl.ompl import setup as ompl_setup
 from apex_ompl.ompl.constrained_space import CONSTRAINED, ManifoldLength
@@ -61,6 +58,11 @@ from apex_ompl.util.display import one_line
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.validation import check_positive
 
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.proof import ConstraintCertificate
+    from apex_ompl.constraints.user import UserConstraint
+
 STRAIGHT_LINE = "straight line"
 UNNAMED = "unnamed"  # planner of a user's function before it is made
 NOT_PROVED = "a path was found but not proved in time"
@@ -82,6 +84,7 @@ class PlanQuery:
         deadline: When the plan is to be ready.
         objective: What the motion is to be, one of :data:`apex_ompl.timing.duration.OBJECTIVES`.
         calm_factor: Duration of a calm motion as a multiple of the fastest one's.
+        improves_motion: Whether faster motions are sought until the time is up.
         status: INVALID_START or INVALID_GOAL, or None.
         reason: Why it is one of these, in one sentence.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started [s].
@@ -100,6 +103,7 @@ class PlanQuery:
     deadline: Deadline
     objective: str = DEFAULT_OBJECTIVE
     calm_factor: float = CALM_FACTOR
+    improves_motion: bool = False
     status: PlanStatus | None = None
     reason: str = ""
     started: float = 0.0
@@ -226,7 +230,7 @@ def assemble(
 
 def check(
     setup: PlanningSetup, planner: AnyPlanner = NAME, *, params: Mapping[str, Any] | None = None, timeout: float = 5.0,
-    objective: str = DEFAULT_OBJECTIVE, calm_factor: float = CALM_FACTOR,
+    objective: str = DEFAULT_OBJECTIVE, calm_factor: float = CALM_FACTOR, timing: bool = False,
     started: float | None = None, times: Mapping[str, float] | None = None, notes: Sequence[str] = (),
 ) -> PlanQuery:  # fmt: skip
     """Check the start, the goals and the planner's parameters, and start the time of the plan.
@@ -238,6 +242,8 @@ def check(
         timeout: Seconds for the steps that follow.
         objective: What the motion is to be, see :func:`apex_ompl.plan`.
         calm_factor: Duration of a calm motion as a multiple of the fastest one's.
+        timing: Whether a motion is made: with the parameter ``anytime`` of apex and another objective than ``length``
+            it is then improved in place of the path, in the step :func:`time`.
         started: Value of ``time.perf_counter`` when the call of ``plan`` started, by default now [s].
         times: Seconds by stage so far.
         notes: What a user should know about this plan.
@@ -249,14 +255,17 @@ def check(
     check_objective(objective, calm_factor)
     started = clock.perf_counter() if started is None else started
     parameters = planners.chosen(planner, params, seed=setup.seed)
+    improves_motion = timing and objective != "length" and knows_obstacles(setup) and setup.constraints is None
+    improves_motion &= isinstance(parameters, ApexParameters) and parameters.anytime
+    if improves_motion:
+        parameters = parameters.changed(anytime=False)
     if setup.constraints is not None and not parameters.constrained:
         raise ParameterError("planner", parameters.name, CONSTRAINED)
     status, reason, nearest = query_fault(setup)
     name, spent = parameters.name or UNNAMED, dict(times or {})
-    deadline = Deadline(timeout)
     return PlanQuery(
-        setup, name, parameters, deadline, objective, calm_factor, status, reason, started, spent, list(notes),
-        nearest_state=nearest,
+        setup, name, parameters, Deadline(timeout), objective, calm_factor, improves_motion, status, reason, started,
+        spent, list(notes), nearest_state=nearest,
     )  # fmt: skip
 
 
@@ -570,7 +579,8 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
     made: TimedPath | None = None
     by_objective = query.objective != "length" and timing.start(scaled) is None and knows_obstacles(setup)
     if setup.constraints is not None:
-        by_objective, timing = False, replace(timing, deviation=min(timing.deviation, CONSTRAINED_DEVIATION))
+        by_objective &= not setup.constraints.user
+        timing = replace(timing, deviation=min(timing.deviation, CONSTRAINED_DEVIATION))
     try:
         with timed(query.times, "timing"):
             if more is not None and (overload := more.gravity_fault(path.states)):
@@ -592,8 +602,10 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         made, motion_proof = better.timed, better.motion_proof
         result = replace(result, path=better.path, **certificate(better.path_proof))
     assert made is not None
-    kept = found[-1].constraints if found else None
-    if kept is not None and setup.constraints is not None:
+    if setup.constraints is not None:
+        from apex_ompl.constraints.proof import prove_motion
+
+        kept = prove_motion(setup.constraints, made.trajectory)
         result = replace(result, **_constraint_fields(setup.constraints, kept))
     use = made.trajectory.use(limits) | ({} if more is None else more.use(made.trajectory))
     return replace(

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,6 +26,9 @@ from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline, basis
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.validation import check_name, check_number, check_states
+
+if TYPE_CHECKING:
+    from apex_ompl.kernel.constraints import ConstraintRows
 
 OBJECTIVES = ("time", "length", "calm")
 """What a plan is to be: fast, short, or calm, which is the least integral of the squared jerk in some more time."""
@@ -62,6 +66,7 @@ class Level:
         slack: Factor on the least knot spacing at the start.
         mean: Mean of slacks times multipliers at the start.
         tolerance: What the objective may be off the optimum.
+        penalty: Weight of half the squared rows of constraints [1/m^2, 1/rad^2].
     """
 
     rate: float
@@ -71,11 +76,12 @@ class Level:
     slack: float
     mean: float
     tolerance: float
+    penalty: float = 1e6
 
 
 LEVELS = (
-    Level(10.0, 4, 0.005, 0.04, 1.03, 1e-4, 4e-2),
-    Level(25.0, 4, 0.005, 0.02, 1.01, 2e-5, 2e-2),
+    Level(10.0, 4, 0.005, 0.04, 1.03, 1e-4, 4e-2, 1e3),
+    Level(25.0, 4, 0.005, 0.02, 1.01, 2e-5, 2e-2, 1e5),
     Level(57.0, 2, 0.005, 0.02, 1.003, 5e-6, 5e-3),
 )
 NARROW_LEVELS = tuple(replace(level, margin=0.001) for level in LEVELS)
@@ -97,13 +103,16 @@ def check_objective(objective: str, calm_factor: float) -> None:
 class DurationOptimizer:
     """Makes motions fast, or calm, among the static obstacles of a kernel."""
 
-    def __init__(self, kernel: Kernel, limits: Limits, held: Flags | None = None) -> None:
+    def __init__(
+        self, kernel: Kernel, limits: Limits, held: Flags | None = None, constraints: ConstraintRows | None = None
+    ) -> None:
         """Optimize motions of the kernel's robot.
 
         Args:
             kernel: The robot among its obstacles.
             limits: Limits of the motions.
             held: Whether joints stay, shape (dof,).
+            constraints: Constraints along the motions, kept by a penalty that grows with the number of knots, or None.
 
         Raises:
             ParameterError: The limits are those of other joints.
@@ -111,7 +120,7 @@ class DurationOptimizer:
         dof = kernel.robot.dof
         if len(limits.velocity) != dof:
             raise ParameterError("limits", len(limits.velocity), f"those of {dof} joints")
-        self.kernel, self.limits = kernel, limits
+        self.kernel, self.limits, self._constraints = kernel, limits, constraints
         self._held = np.zeros(dof, bool) if held is None else held
         self._limits = np.stack([limits.velocity, limits.acceleration, limits.jerk])
         self._limits[:, self._held] = 0.0
@@ -220,7 +229,14 @@ class DurationOptimizer:
             0.0 if calm else 1.0, calm, STEPS,
         )  # fmt: skip
         grid = _grid(len(control), samples or level.samples)
-        report = lower_duration(self.kernel, grid, self._limits, PINNED, control, spacing, settings)
+        if self._constraints is None:
+            report = lower_duration(self.kernel, grid, self._limits, PINNED, control, spacing, settings)
+        else:
+            from apex_ompl.kernel.constraints import lower_constrained_duration
+
+            report = lower_constrained_duration(
+                self.kernel, self._constraints, grid, self._limits, PINNED, control, spacing, settings, level.penalty
+            )
         least = least_knot_spacing(control, self.limits)
         final = max(spacing, least) if calm else least
         return TimedSpline(control, final, spline.start), report

@@ -11,6 +11,7 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Alignment
 
 FORWARD, DOWN = (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)
+Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,27 @@ class AlignmentSpecification:
     scene: Callable[[], Sequence[Obstacle]]
     held: Callable[[], HandObjects]
     alignment: Alignment
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class CarrySpecification:
+    """Problem with a constraint: a loaded tray in both hands stays level, or a cup in each hand upright.
+
+    Attributes:
+        file: File of the problem.
+        scene: Its obstacles.
+        start: Middle of the tray, or grasp points of the left and the right hand [m].
+        goal: The same at the goal.
+        yaws: Of the fingers of both hands with cups, at start and goal [rad].
+        seed: Of inverse kinematics.
+    """
+
+    file: str
+    scene: Callable[[], Sequence[Obstacle]]
+    start: tuple[Point, ...]
+    goal: tuple[Point, ...]
+    yaws: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.0), (0.0, 0.0))
     seed: int = 0
 
 
@@ -112,7 +134,13 @@ def two_walls() -> list[Obstacle]:
     ]
 
 
-SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification, ...] = (
+def counter() -> list[Obstacle]:
+    """A low wall between two places of a counter, and a shade that hangs over it."""
+    shade = Obstacle(name="shade", cylinder={"radius": 0.12, "length": 0.2}, position=(0.5, 0.0, 0.95))
+    return [Obstacle(name="wall", box=(0.7, 0.04, 0.34), position=(0.55, 0.0, 0.17)), shade]
+
+
+SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecification, ...] = (
     ReachSpecification(
         "problems/data/shelf_swap.yaml", "dual_panda_softhand", shelf,
         (HandPose((0.68, 0.06, 0.87), FORWARD), HandPose((0.68, -0.48, 0.27), FORWARD)),
@@ -155,5 +183,11 @@ SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification, ...] = (
     AlignmentSpecification(
         "problems/data/handover.yaml", wall_between(), bar,
         Alignment(kind="handover", first="bar", second="right_hand"),
+    ),
+    CarrySpecification("problems/data/carry_tray.yaml", counter, ((0.5, 0.42, 0.28),), ((0.5, -0.42, 0.28),)),
+    CarrySpecification(
+        "problems/data/pour_upright.yaml", wall_between(0.4),
+        ((0.48, 0.3, 0.25), (0.48, -0.3, 0.25)), ((0.52, 0.07, 0.52), (0.52, -0.07, 0.7)),
+        ((0.4, -0.4), (-0.5, 0.5)),
     ),
 )  # fmt: skip

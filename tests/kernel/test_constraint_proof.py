@@ -7,10 +7,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from constraint_groups import Placed, Real, Sample, Tree, sample
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from apex_ompl.errors import ParameterError
@@ -30,6 +32,7 @@ from apex_ompl.kernel.constraints import (
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.tables import JointSpec, RobotTables
 from apex_ompl.robot import Robot
+from apex_ompl.timing import Timing, time_path
 
 KINDS = [POSITION, AXIS, ROTATION]
 EVERYTHING = [100.0, 4.0, 4.0]  # tolerances that every interval keeps
@@ -210,24 +213,35 @@ def test_tolerances_above_the_largest_residual_are_proved_and_those_below_refuse
         some[g] = 1.01
 
 
-def test_a_path_shifted_to_its_tolerance_is_refused_one_percent_beyond_and_proved_one_percent_below() -> None:
+@pytest.mark.parametrize("is_motion", [False, True])
+def test_a_curve_shifted_to_its_tolerance_is_refused_one_percent_beyond_and_proved_one_percent_below(
+    is_motion: bool,
+) -> None:
     """States of a closed chain are moved until the largest violation between them, searched for, is the tolerance."""
     tables, tolerance = planar(0.5, 0.4, 0.3), 1e-3
     rows = tip_rows(tables, 0.3, tolerance, rows=2, at=0.9)
     angles = np.array([0.3, -1.0, 0.9])
     states, ok = rows.project(angles + np.linspace(0.0, 1.0, 40)[:, None] * np.array([0.8, -0.3, 0.2]))
-    assert ok.all() and prove_path(rows, states).proved
     bent = np.sin(np.linspace(0.0, math.pi, len(states)))[:, None] * np.array([0.0, 0.0, 1.0])
+
+    def shifted(size: float) -> Curve:
+        if not is_motion:
+            return Curve(states + size * bent)
+        times = np.linspace(0.0, 2.0, len(states))
+        spline = CubicSpline(times, states + size * bent)
+        return Curve(spline(times), times, spline(times, 1), spline(times, 2))
+
+    assert ok.all() and shifted(0.0).prove(rows).proved
     low, high = 0.0, 0.1
     for _ in range(25):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if largest(rows, Curve(states + middle * bent))[0] < tolerance else (low, middle)
-    path = states + low * bent
-    assert largest(rows, Curve(path))[0] == pytest.approx(tolerance, rel=1e-6)
+        low, high = (middle, high) if largest(rows, shifted(middle))[0] < tolerance else (low, middle)
+    curve = shifted(low)
+    assert largest(rows, curve)[0] == pytest.approx(tolerance, rel=1e-6)
     for share, is_proved in ((0.99, False), (0.9999, False), (1.0001, True), (1.01, True)):
-        assert prove_path(tip_rows(tables, 0.3, share * tolerance, rows=2, at=0.9), path).proved == is_proved
-    for share, is_proved in ((0.99, True), (1.01, False)):  # the path is shifted, and not the tolerance
-        assert prove_path(rows, states + share * low * bent).proved == is_proved
+        assert curve.prove(tip_rows(tables, 0.3, share * tolerance, rows=2, at=0.9)).proved == is_proved
+    for share, is_proved in ((0.99, True), (1.01, False)):  # the curve is shifted, and not the tolerance
+        assert shifted(share * low).prove(rows).proved == is_proved
 
 
 @pytest.mark.parametrize("is_motion", [False, True])
@@ -242,6 +256,31 @@ def test_a_spike_between_the_states_that_are_examined_first_is_found(is_motion: 
     assert curve.prove(rows).proved == (not is_motion)
     for share, is_proved in ((1.001, not is_motion), (0.999, False)):
         assert curve.prove(tip_rows(tables, 1.0, share * (1.0 - math.cos(1.0)), 1, 1.0)).proved == is_proved
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_second_order_terms_are_those_of_chains_for_which_they_add_up(kind: int) -> None:
+    """Of a stretched arm, and of two crossed joints, on an interval around a state: the bound is all but exact."""
+    size = 0.02
+    if kind == POSITION:  # joints that turn the same way fold a stretched arm
+        step, rows = np.full(3, size), tip_rows(planar(0.5, 0.4, 0.3), 0.3, 1.0, 1, 1.2)
+    else:  # the first joint turns the change that the second one makes
+        step = np.array([5.0 * size, size] if kind == AXIS else [size, size])
+        axes = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
+        specs = [JointSpec(0), *(JointSpec(k, REVOLUTE, np.eye(4), axes[k], k) for k in range(2))]
+        tree = JointTree(specs)
+        box = np.ones(2)
+        tables = robot_builder.robot_tables(
+            "crossed", ["a", "b"], lower=-box, upper=box, tree=tree, bodies=[], pairs=[]
+        )  # fmt: skip
+        away = pin.exp3(np.array([0.3, 0.0, 0.0]))  # along the product of the axes, -x, or across both
+        first, second = JointFrame(0, away, np.zeros(3)), JointFrame(2, tree.turns[2][:3, :3].T, np.zeros(3))
+        rows = ConstraintRows(tables, [ConstraintGroup(kind, 2 if kind == AXIS else 3, first, second, 1.0)])
+    at = rows.norms(0.0 * step)[0, 0]
+    true = rows.norms(np.linspace(-1.0, 1.0, 41)[:, None] * step).max() - at
+    bound = prove_path(rows, [-step, step]).bounds[0] - at
+    assert true > 0.1 * size**2
+    assert true - 1e-12 <= bound <= 1.25 * true
 
 
 @pytest.mark.parametrize("angle", [1e-3, 0.2, 1.0, 1.7, 2.5, 3.1])
@@ -360,7 +399,7 @@ def test_one_state_is_a_curve() -> None:
 
 
 def test_a_tray_between_two_arms_is_proved_and_checked_by_pinocchio(robot: Robot) -> None:
-    """On states projected onto a closed chain, and along a motion through them, beside the group that keeps it level."""
+    """On states projected onto a closed chain, and along a motion past them, beside the group that keeps it level."""
     real, rng = Real(robot), np.random.default_rng(2)
     left, right = Placed("left_link8", np.eye(4)), Placed("right_link8", np.eye(4))
     pose = np.linalg.inv(real.placement(right, robot.home)) @ real.placement(left, robot.home)
@@ -372,15 +411,20 @@ def test_a_tray_between_two_arms_is_proved_and_checked_by_pinocchio(robot: Robot
     ]
     found, hands = Sample(real, groups, pairs), robot.groups["hands"]
     rows = ConstraintRows(real.tables, groups, fixed=hands)
-    goals, ok = rows.project(
-        np.where(np.isin(np.arange(robot.dof), hands), 0.0, 0.3) * rng.normal(size=(40, robot.dof)) + robot.home
-    )
+    spread = np.full(robot.dof, 0.3)
+    spread[hands] = 0.0
+    goals, ok = rows.project(robot.home + spread * rng.normal(size=(40, robot.dof)))
     goal = goals[ok][0]
     path, ok = rows.project(robot.home + np.linspace(0.0, 1.0, 65)[:, None] * (goal - robot.home))
     assert ok.all()
     proof = prove_path(rows, path)
     norms = found.norms(Curve(path).dense())
     assert proof.proved and (norms <= proof.bounds).all() and (norms.max(axis=0) >= proof.violations - 1e-9).all()
+    times, *states = time_path(path, robot.limits, robot.joint_names, Timing(deviation=0.005)).trajectory.knots
+    motion = Curve(states[0], times, states[1], states[2])
+    proof, norms = motion.prove(rows), found.norms(motion.dense())
+    assert proof.proved and (norms <= proof.bounds).all() and (norms.max(axis=0) >= proof.violations - 1e-9).all()
+    assert (norms.max(axis=0) > 1e-6).all()
     off = path.copy()
     off[30, 2] += 0.02
     assert not prove_path(rows, off).proved and prove_path(rows, off).piece in {28, 29, 30}

@@ -263,8 +263,8 @@ def test_a_path_that_is_not_timed_in_time(
     assert (result.status, result.reason) == (PlanStatus.TIMEOUT, NOT_TIMED)
     assert result.path is found.path and result.trajectory is None and query.times["timing"] >= 0.0
 
-    def ends(checker: object, motion: object, start: object, goals: object, *, deadline: float) -> FullCheck:
-        assert deadline == query.deadline.at
+    def ends(checker: object, motion: object, *ends: object, deadline: float, constraints: object) -> FullCheck:
+        assert deadline == query.deadline.at and constraints is None
         query.deadline.restart(0.0)
         return FullCheck(False, "not proved in time", None, timed_out=True)
 

@@ -174,7 +174,7 @@ def test_splits_are_by_seed() -> None:
         ("shelf/hard", ParameterError, "an id such as shelf/easy/12"),
         ("shelf/hard/x12", ParameterError, "an id such as shelf/easy/12"),
         ("shelf/hard/007", ParameterError, "an id such as shelf/easy/12"),
-        ("shelf/HARD/7", UnknownNameError, "did you mean 'hard'|known: easy, extreme, hard, medium"),
+        ("shelf/HARD/7", UnknownNameError, "did you mean 'hard'|known: cups, easy, extreme, hard, level, medium, tray"),
         ("there/is/none", ApexError, "no such file"),
     ],
 )

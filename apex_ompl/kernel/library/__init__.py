@@ -21,7 +21,7 @@ from importlib.machinery import ExtensionFileLoader, ModuleSpec
 from pathlib import Path
 from typing import Any
 
-from apex_ompl.kernel.compiled.entry_points import PLANS, RUNS, Group
+from apex_ompl.kernel.compiled.entry_points import CONSTRAINED, PLANS, RUNS, Group
 
 LOG = logging.getLogger("apex_ompl")
 
@@ -130,6 +130,11 @@ def compile_for_plans() -> None:
 def compile_for_runs() -> None:
     """Compile what runs among dynamic obstacles need and neither the library nor the cache has, once in a process."""
     _compile(RUNS)
+
+
+def compile_for_constraints() -> None:
+    """Compile what plans under constraints need and neither the library nor the cache has, once in a process."""
+    _compile(CONSTRAINED)
 
 
 def _compile(group: Group) -> None:

@@ -7,24 +7,24 @@ with x = m + u h and |u| <= 1, its states are
 
 s, b and c the derivatives of Taylor's theorem, d rounding and gaps between pieces, so that |delta_i| <= w_i =
 |s_i| + |b_i| + |c_i| + d_i. The links of a group are one serial chain from A to B, whose joints are numbered from A.
-Let y be the place of B, its z axis, or twice the vector part of its quaternion, each seen from A. On this box, for
+Let y be the place p of B, its z axis, or twice the vector part of its quaternion, each seen from A, and a_i the axis of
+joint i through o_i, all at q_m. With
 
-    far_i = |a_i x (p - o_i)| at q_m,   arm_i = far_i + m_i,   m_i = sum of w_k arm_k over k > i,
+    far_i = |a_i x (p - o_i)|  (for the z axis |a_i x z|; for prismatic joints 1, and 0 for the z axis),
+    m_i = sum of w_k far_k over k > i,
 
-a_i the axis through o_i (for the z axis: it in place of p - o_i, and arms of at most 1; prismatic joints have arm 1 for
-places and 0 for axes), the distance of p from the axis of joint i is at most arm_i, and by Taylor's theorem
+products of exponentials show that y moves by at most m_0 on this box, and that
 
-    |y(q) - y_m - J delta| <= 1/2 sum_i w_i arm_i (w_i + 2 sum_k w_k),
+    |y(q) - y_m - J delta| <= sum of w_i (w_i far_i / 2 + m_i) over revolute joints.
 
-the inner sum over revolute joints k < i, the first term for revolute joints i alone. For the quaternion the sum is
-sum_i (v w_i^2 / 2 + w_i sum_{k < i} w_k), v >= |vector part| on the box. J delta is u J s + u^2 J b + u^3 J c + J e,
-and a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were independent. So |y| is at most
+For the quaternion it is sum_i w_i (w_i |y_m| / 8 + w_i^2 / 24 + m_i / 2) with far_i = 1. J delta is
+u J s + u^2 J b + u^3 J c + J e, and a norm is convex: it is largest at u = +-1 and u^2 = 0 or 1 as if these were
+independent. So |y| is at most
 
-    max |y_m +- J s + {0, 1} J b| + |J c| + sum_i d_i far_i + half the sum above,
+    max |y_m +- J s + {0, 1} J b| + |J c| + sum_i d_i far_i + the remainder above,
 
-which is a bound on |r| for POSITION, on sin(theta) for AXIS where z_A . z_B, bounded likewise, stays positive, and on
-2 sin(theta / 2) for ROTATION. Another bound is |r| <= |r_m| + m_0, as no point turns or moves farther than its arc. The
-derivation is in docs/constraints.md.
+which is a bound on |r| for POSITION, on sin(theta) for AXIS where z_A . z_B, bounded in the same way, is positive, and
+on 2 sin(theta / 2) for ROTATION. Another bound is |r| <= |r_m| + m_0. The derivation is in docs/constraints.md.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ from apex_ompl.kernel.compiled.robot.kinematics import place_joints
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 PROVED, VIOLATED, UNDECIDED, INVALID = range(4)  # outcomes
+TIGHT = 0.25  # share of a tolerance by which bounds may exceed |r|, while intervals are few
 ROUNDING = 1e-12  # of states and residuals, for frames within some 100 m
 DEEPEST = 40  # bisections of a piece
 INTERVALS, MORE_INTERVALS = 20_000, 100  # most intervals: so many, and so many for each piece
@@ -98,15 +99,15 @@ class Sweep(NamedTuple):
     """Sums over the links of a group, from its second frame to its first.
 
     Attributes:
-        moved: Bound m_0 on the length of the arc.
-        curvature: Sum of w_i arm_i (w_i + 2 sum_k w_k).
-        squares: Sum of w_i^2 over revolute joints.
+        moved: Sum m_0 of w_i far_i.
+        crossed: Sum of w_i m_i over revolute joints.
+        squared: Sum of w_i^2 far_i over revolute joints.
         deviated: Sum of d_i far_i.
     """
 
     moved: float
-    curvature: float
-    squares: float
+    crossed: float
+    squared: float
     deviated: float
 
 
@@ -121,7 +122,7 @@ def _sweep(
     velocities of that place, changes of that axis, and angular velocities for ROTATION.
     """
     kind, linear = c.kind[g], p.linear
-    moved = curvature = squares = deviated = 0.0
+    moved = crossed = squared = deviated = 0.0
     for m in range(3):
         linear[m, 0] = linear[m, 1] = linear[m, 2] = 0.0
     for n in range(c.span[g, 0], c.span[g, 0] + c.span[g, 1]):
@@ -131,26 +132,25 @@ def _sweep(
         turns = t.joint_kind[j] == REVOLUTE
         if not turns and kind != POSITION:
             continue
-        u, v, q, far, arm = r[0, 2], r[1, 2], r[2, 2], 1.0, 1.0
+        u, v, q, far = r[0, 2], r[1, 2], r[2, 2], 1.0
         if turns and kind != ROTATION:
             e, f, h = x, y, z
             if kind == POSITION:
                 e, f, h = x - o[0], y - o[1], z - o[2]
             u, v, q = v * h - q * f, q * e - u * h, u * f - v * e
             far = math.sqrt(u * u + v * v + q * q)
-            arm = far + moved if kind == POSITION else min(far + moved, 1.0)
         width = abs(ratio) * p.width[k]
-        curvature += width * arm * width if turns else 0.0
-        curvature += 2.0 * width * moved if turns else 0.0
-        squares += width * width
+        if turns:
+            crossed += width * moved
+            squared += width * width * far
         deviated += abs(ratio) * p.deviation[k] * far
-        moved += width * arm
+        moved += width * far
         for m in range(3):
             factor = c.side[n] * ratio * p.rates[m, k]
             linear[m, 0] += factor * u
             linear[m, 1] += factor * v
             linear[m, 2] += factor * q
-    return Sweep(moved, curvature, squares, deviated)
+    return Sweep(moved, crossed, squared, deviated)
 
 
 @inlined
@@ -193,10 +193,9 @@ def _angle_bound(p: ConstraintProofBuffers, rest: float) -> float:
 
 @inlined
 def _turn_bound(
-    c: ConstraintArrays, g: int, p: ConstraintProofBuffers, b: RowBuffers, sweep: Sweep, size: float, sine: float,
-    cosine: float,
+    p: ConstraintProofBuffers, b: RowBuffers, sweep: Sweep, sine: float, cosine: float
 ) -> float:  # fmt: skip
-    """Return a bound on the angle of a ROTATION, ``size`` in the middle, where its residual is in ``b.group``."""
+    """Return a bound on the angle of a ROTATION, whose sine and cosine in the middle are given, residual in ``b``."""
     if cosine < LEAST_COSINE:
         return math.pi
     half = math.sqrt(0.5 * (1.0 + cosine))
@@ -209,9 +208,9 @@ def _turn_bound(
         p.linear[m, 0] = half * u + v * z - q * y
         p.linear[m, 1] = half * v + q * x - u * z
         p.linear[m, 2] = half * q + u * y - v * x
-    vector = min(0.5 * (size + sweep.moved), 1.0)
-    curvature = 0.5 * (sweep.curvature - sweep.squares) + 0.5 * vector * sweep.squares
-    chord = 0.5 * (_largest(p, 3) + sweep.deviated + 0.5 * curvature + ROUNDING)
+    now = 2.0 * math.sqrt(x * x + y * y + z * z)
+    rest = 0.5 * sweep.crossed + sweep.squared * (now / 8.0 + sweep.moved / 24.0)  # w_i^3 <= w_i^2 m_0
+    chord = 0.5 * (_largest(p, 3) + sweep.deviated + rest + ROUNDING)
     return 2.0 * math.atan2(chord, math.sqrt(1.0 - chord * chord)) if chord < 1.0 else math.pi
 
 
@@ -238,15 +237,15 @@ def bound_group(
         x, y, z = b.place[1, 0], b.place[1, 1], b.place[1, 2]
     sweep = _sweep(t, w, c, g, p, x, y, z)
     _to_axes(p, first)
-    bound = size + sweep.moved
+    bound, rest = size + sweep.moved, sweep.deviated + sweep.crossed + 0.5 * sweep.squared
     if kind == POSITION:
         for i in range(c.rows[g]):
             p.center[i] = b.group[i]
-        bound = min(bound, _largest(p, c.rows[g]) + sweep.deviated + 0.5 * sweep.curvature)
+        bound = min(bound, _largest(p, c.rows[g]) + rest)
     elif kind == AXIS:
-        bound = min(bound, _angle_bound(p, sweep.deviated + 0.5 * sweep.curvature + ROUNDING))
+        bound = min(bound, _angle_bound(p, rest + ROUNDING))
     else:
-        bound = min(bound, _turn_bound(c, g, p, b, sweep, size, sine, cosine))
+        bound = min(bound, _turn_bound(p, b, sweep, sine, cosine))
     return size, bound + ROUNDING
 
 
@@ -295,16 +294,19 @@ def _set_interval(middle: float, half: float, p: ConstraintProofBuffers) -> None
 
 @inlined
 def _examine(
-    t: RobotArrays, w: Workspace, c: ConstraintArrays, p: ConstraintProofBuffers, b: RowBuffers
+    t: RobotArrays, w: Workspace, c: ConstraintArrays, p: ConstraintProofBuffers, b: RowBuffers, tight: bool
 ) -> tuple[int, int, float]:
-    """Return outcome, failing group and its |r| for the interval that is set; UNDECIDED where it is to be bisected."""
+    """Return outcome, failing group and its |r| for the interval that is set; UNDECIDED where it is to be bisected.
+
+    Where it is to be ``tight``, a bound is at most a share TIGHT of the tolerance above |r| in the middle.
+    """
     place_joints(t, w, p.state, c.chain, 0, len(c.chain))
     for g in range(len(c.kind)):
         size, bound = bound_group(t, w, c, g, p, b)
         p.violations[g] = max(p.violations[g], size)
         if not size <= c.tolerance[g]:
             return VIOLATED, g, size
-        if not bound <= c.tolerance[g]:
+        if not bound <= (min(c.tolerance[g], size + TIGHT * c.tolerance[g]) if tight else c.tolerance[g]):
             return UNDECIDED, g, size
         p.found[g] = bound
     for g in range(len(c.kind)):
@@ -363,7 +365,7 @@ def prove_constraints(
             middle = 0.5 * (start + end)
             _set_interval(middle, 0.5 * (end - start), p)
             p.counts[0] += 1
-            outcome, g, size = _examine(t, w, c, p, b)
+            outcome, g, size = _examine(t, w, c, p, b, 2 * p.counts[0] < most)
             if outcome == PROVED:
                 continue
             last = top + 2 > len(p.stack) or p.counts[0] >= most

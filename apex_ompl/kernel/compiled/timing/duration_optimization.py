@@ -24,7 +24,8 @@ The margin of a pair that is nearer at the start or the goal is lower, so that m
 from __future__ import annotations
 
 import math
-from typing import Annotated, NamedTuple
+from collections.abc import Callable
+from typing import Annotated, Any, NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import GRID, RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.check.clearance import (
@@ -80,6 +81,13 @@ class DurationSettings(NamedTuple):
     calm: float
     steps: int
 
+
+Penalty = Any
+Penalize = Callable[..., None]
+"""Compiled function ``(penalty, t, w, q, b)`` that adds further terms of the objective at a sample q.
+
+Their negative gradient is added to ``b.sample_gradient``, the lower half of their matrix to ``b.sample_gram``.
+"""
 
 Numbers = tuple[float, float, float, float, float, float, float, float, float, int]  # of DurationSettings
 
@@ -363,10 +371,25 @@ def _sum_rows(mu: float, now: int, k: int, b: Buffers) -> None:
                 target[i] += e * row[i]
 
 
+class NoPenalty(NamedTuple):
+    """No further terms of the objective.
+
+    Attributes:
+        always: 0, as samples without clearances add nothing.
+    """
+
+    always: int
+
+
+@reassociating_inlined
+def _no_penalty(penalty: NoPenalty, t: RobotArrays, w: Workspace, q: Floats, b: Buffers) -> None:
+    """Add nothing to the gradient and the matrix of a sample."""
+
+
 @reassociating_inlined
 def _add_clearances(
     t: RobotArrays, s: SceneArrays, w: Workspace, p: Problem, control: Floats, settings: DurationSettings, mu: float,
-    now: int, ends: int, b: Buffers,
+    now: int, ends: int, b: Buffers, penalize: Penalize, penalty: Penalty,
 ) -> float:  # fmt: skip
     """Add the clearances at all samples; return the least of them over its margin [m], minus infinity at a fault."""
     points, dof = control.shape
@@ -379,10 +402,11 @@ def _add_clearances(
         b.begin[now, k] = first = count
         count = _clearances(t, s, w, q, settings.horizon, count, b.clearance, b.row, b.key[now])
         b.begin[now, k + 1] = count
-        if count == first:
+        if count == first and not penalty.always:
             continue
         worst = min(worst, _set_rows(p, settings.margin, mu, now, k, ends, b))
         _sum_rows(mu, now, k, b)
+        penalize(penalty, t, w, q, b)
         _add_sample(p, k, free, dof, b)
     return worst * UNIT
 
@@ -598,6 +622,57 @@ def _start_duals(t: RobotArrays, p: Problem, control: Floats, u: float, mu: floa
         b.begin[0, k] = b.begin[1, k] = 0
 
 
+@reassociating_inlined
+def descend(
+    t: RobotArrays, s: SceneArrays, w: Workspace, p: Problem, spacing: float, control: Floats,
+    settings: DurationSettings, b: Buffers, penalize: Penalize, penalty: Penalty,
+) -> tuple[float, float, float, int]:  # fmt: skip
+    """Take the steps on control points, in place; arguments and result as of :func:`lower_duration`.
+
+    Args:
+        t: The robot.
+        s: The scene.
+        w: Workspace.
+        p: The motion.
+        spacing: Knot spacing, with which the motion is inside all limits [s].
+        control: The control points.
+        settings: Settings.
+        b: Buffers.
+        penalize: Adds further terms of the objective.
+        penalty: Data of these; where its ``always`` is not 0, they are asked for at samples without clearances, too.
+    """
+    points, dof = control.shape
+    unknowns = len(b.gradient)
+    ends = _clearances(t, s, w, control[0], settings.margin, 0, b.end_clearance, b.row[:0], b.end_key)
+    ends = _clearances(t, s, w, control[points - 1], settings.margin, ends, b.end_clearance, b.row[:0], b.end_key)
+    u, mu, total, worst, now, taken = math.log(spacing), settings.mean, math.inf, -math.inf, 0, 0
+    _start_duals(t, p, control, u, mu, b)
+    mu *= settings.decrease
+    while taken < settings.steps:
+        for j in range(unknowns):
+            i = p.pinned + j // dof
+            row = b.gram[j]
+            for k in range(len(row)):
+                row[k] = 0.0
+            for k in range(min(WIDTH, points - p.pinned - i)):
+                row[k * dof] = settings.prox * p.mass[i, k]
+            b.gradient[j] = b.border[j] = 0.0
+        corner, slope = _add_limits(p, control, u, mu, settings, b)
+        _add_bounds(t, p, control, mu, b)
+        worst = _add_clearances(t, s, w, p, control, settings, mu, now, ends, b, penalize, penalty)
+        if worst == -math.inf or not _factorize(b.gram):
+            break
+        du = _newton_step(corner, slope, settings.hurry, b)
+        primal, dual = _longest_steps(t, p, control, u, du, mu, now, settings.largest, b)
+        u, total, count = _take_step(t, p, control, u, du, mu, now, primal, dual, b)
+        taken += 1
+        now = 1 - now
+        mu = max(settings.decrease * total / count, LEAST_MEAN)
+        if total < settings.tolerance and primal > 0.5 and worst > -LEAST_SLACK * UNIT:
+            break
+    return math.exp(u), total, worst, taken
+
+
 @reassociating_entry_point
 def lower_duration(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats, weights: Floats,
@@ -635,31 +710,4 @@ def lower_duration(
     p, settings = Problem(weights, first, mass, limits, pinned), DurationSettings(*numbers)
     unknowns = (points - 2 * pinned) * dof
     b = buffers_view(bi, bf, (unknowns, WIDTH * dof, points, dof, ROWS_PER_SAMPLE * len(weights), len(weights) + 1))
-    ends = _clearances(t, s, w, control[0], settings.margin, 0, b.end_clearance, b.row[:0], b.end_key)
-    ends = _clearances(t, s, w, control[points - 1], settings.margin, ends, b.end_clearance, b.row[:0], b.end_key)
-    u, mu, total, worst, now, taken = math.log(spacing), settings.mean, math.inf, -math.inf, 0, 0
-    _start_duals(t, p, control, u, mu, b)
-    mu *= settings.decrease
-    while taken < settings.steps:
-        for j in range(unknowns):
-            i = pinned + j // dof
-            row = b.gram[j]
-            for k in range(len(row)):
-                row[k] = 0.0
-            for k in range(min(WIDTH, points - pinned - i)):
-                row[k * dof] = settings.prox * mass[i, k]
-            b.gradient[j] = b.border[j] = 0.0
-        corner, slope = _add_limits(p, control, u, mu, settings, b)
-        _add_bounds(t, p, control, mu, b)
-        worst = _add_clearances(t, s, w, p, control, settings, mu, now, ends, b)
-        if worst == -math.inf or not _factorize(b.gram):
-            break
-        du = _newton_step(corner, slope, settings.hurry, b)
-        primal, dual = _longest_steps(t, p, control, u, du, mu, now, settings.largest, b)
-        u, total, count = _take_step(t, p, control, u, du, mu, now, primal, dual, b)
-        taken += 1
-        now = 1 - now
-        mu = max(settings.decrease * total / count, LEAST_MEAN)
-        if total < settings.tolerance and primal > 0.5 and worst > -LEAST_SLACK * UNIT:
-            break
-    return math.exp(u), total, worst, taken
+    return descend(t, s, w, p, spacing, control, settings, b, _no_penalty, NoPenalty(0))
