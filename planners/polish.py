@@ -14,7 +14,6 @@ from ompl import geometric as og
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.constraints.paths import ConstrainedPaths
-from apex_ompl.ompl.constrained_space import RANGE
 from apex_ompl.ompl.own_planner import OwnPlanner, Status
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.repair import exact_paths, simplify
@@ -178,5 +177,5 @@ class RRTConnectPolish(Parameters):
         optimizer = Optimizer(Spline(self.control_points, self.pinned), settings)
         optimizer.prepare(validator.kernel)
         inner = og.RRTConnect(si)
-        inner.setRange(self.range if validator.constraints is None else RANGE)
+        inner.setRange(self.range)
         return PolishedRRTConnect(si, validator, optimizer, inner)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from apex_ompl.constraints.constraint_set import ConstraintSet
 
 RANGE = 0.5  # of trees on the manifold where none is given [rad]
-DELTA = 0.2  # step of OMPL's interpolation on the manifold [rad]
+DELTA = 0.4  # step of OMPL's interpolation on the manifold [rad]
 LAMBDA = 2.0  # largest length of a projected step, and of a whole motion, as a multiple of the straight one
 TOLERANCE = 1e-4  # of all rows together, where OMPL's own projection stops [m, rad]
 CONSTRAINED = "one that plans under constraints along the path, such as apex, rrtconnect or prm"

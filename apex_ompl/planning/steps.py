@@ -546,12 +546,16 @@ def _full_check(query: PlanQuery, path: Array | Trajectory) -> FullCheck:
 def _checked(found: FoundPath, path: Path) -> ProvedPath:
     """Return an approximate solution with its certificate, or why it has none."""
     query, setup, reason = found.query, found.query.setup, found.reason
-    check = full_check(setup.checker, path.states, setup.start, deadline=query.deadline.at)
+    along = setup.constraints
+    if along is not None and not query.parameters.smooth:
+        path = next((Path(states) for states in exact_paths(setup.checker, along, path.states)), path)
+    check = full_check(setup.checker, path.states, setup.start, deadline=query.deadline.at, constraints=along)
     if check.timed_out:
         reason += ", and the path was not checked in time"
     elif not check:
         reason += f", and the path fails the full check, {check.reason}"
-    return ProvedPath(query, found.status, reason, path, found.solved_by, check.proof if check else None)
+    proof, kept = (check.proof, check.constraints) if check else (None, None)
+    return ProvedPath(query, found.status, reason, path, found.solved_by, proof, kept)
 
 
 def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> PlanResult:
