@@ -110,6 +110,7 @@ class LineTracker:
         if self._complete(best) and not self._cost(best):
             return best
         for _ in range(ROUNDS):
+            before = len(best.u)
             for improved in (self.relaxed, self.chosen):
                 if self.stop() or len(track.u) < 2:
                     return best
@@ -119,7 +120,7 @@ class LineTracker:
                 if self._complete(best):
                     return best
             count, track = len(track.u), self.tracked(track)
-            if len(track.u) == count:
+            if len(track.u) == count or len(best.u) == before:
                 break
         return best
 
