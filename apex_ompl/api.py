@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,11 +22,13 @@ from apex_ompl.util.files import is_file, path_text
 from apex_ompl.util.forking import unforked
 
 if TYPE_CHECKING:
+    from apex_ompl.constraints.user import UserConstraint
     from apex_ompl.loop.environment import Environment
     from apex_ompl.loop.result import RunResult
     from apex_ompl.loop.sensor import Sensor
     from apex_ompl.moving.replanner import Replanner
     from apex_ompl.moving.settings import LoopSettings
+    from apex_ompl.scene.constraints import Constraint
 
 
 @unforked()
@@ -80,6 +82,7 @@ def plan(
     objective: str = "time",
     calm_factor: float = 1.1,
     leave_contact: float = 0.0,
+    constraints: Sequence[Constraint | UserConstraint] = (),
 ) -> PlanResult:
     """Plan a path, prove it by the full check, and optimize its motion.
 
@@ -107,6 +110,8 @@ def plan(
         calm_factor: See ``objective``, 1 to 100.
         leave_contact: Depth of contacts at the start that the path may leave along growing clearance, up to 0.001 [m];
             a note says so, since that way out is not proved.
+        constraints: Constraints along the path (:mod:`apex_ompl.scene.constraints`, or a user's own), besides those of
+            the problem.
 
     Returns:
         The result; it is true only for an exact path that passed the full check and, unless timing is off, is timed.
@@ -123,6 +128,7 @@ def plan(
         return kept.plan_problem(
             loaded, planner, timeout=timeout, seed=seed, simplify=simplify, params=params, snapshot=snapshot,
             timing=timing, objective=objective, calm_factor=calm_factor, leave_contact=leave_contact,
+            constraints=constraints,
         )  # fmt: skip
 
 

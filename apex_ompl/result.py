@@ -39,7 +39,11 @@ FIRST = INSIDE + "first"
 
 
 class PlanStatus(StrEnum):
-    """OMPL's planner status names, and TIMING_FAILED for a proven path that could not be timed."""
+    """OMPL's planner status names, and three more.
+
+    TIMING_FAILED is for a proven path that could not be timed, START_OFF_CONSTRAINT and GOAL_OFF_CONSTRAINT for a start
+    or goals that violate a constraint along the path.
+    """
 
     UNKNOWN = "UNKNOWN"
     INVALID_START = "INVALID_START"
@@ -52,6 +56,8 @@ class PlanStatus(StrEnum):
     ABORT = "ABORT"
     INFEASIBLE = "INFEASIBLE"
     TIMING_FAILED = "TIMING_FAILED"
+    START_OFF_CONSTRAINT = "START_OFF_CONSTRAINT"
+    GOAL_OFF_CONSTRAINT = "GOAL_OFF_CONSTRAINT"
 
     @classmethod
     def of(cls, status: ob.PlannerStatus) -> PlanStatus:
@@ -98,6 +104,11 @@ class PlanResult:
         notes: Notes for the user, such as on a snapshot of dynamic obstacles.
         dynamic_obstacles: Names of the dynamic obstacles that ``trajectory``, started at time 0, was proved clear of;
             ``path`` and the clearances are those among the static obstacles.
+        constraint_violation: Constraint along the path -> its largest violation at states of ``trajectory`` that were
+            examined, or without a motion of ``path`` [m or rad].
+        constraint_bound: The same -> a proved bound on its violation anywhere on it.
+        nearest_state: For a start or a goal that violates a constraint, a state near it that does not, shape (dof,), or
+            None.
     """
 
     status: PlanStatus
@@ -125,6 +136,9 @@ class PlanResult:
     held_joints: tuple[str, ...] = ()
     robot_digest: str = ""
     dynamic_obstacles: tuple[str, ...] = ()
+    constraint_violation: Mapping[str, float] = field(default_factory=dict)
+    constraint_bound: Mapping[str, float] = field(default_factory=dict)
+    nearest_state: Array | None = None
 
     def __bool__(self) -> bool:
         """Whether there is an exact path that passed the full check and, unless timing is off, is timed."""
@@ -165,6 +179,9 @@ class PlanResult:
             "times": dict(self.times),
             "notes": list(self.notes),
             "dynamic_obstacles": list(self.dynamic_obstacles),
+            "constraint_violation": dict(self.constraint_violation),
+            "constraint_bound": dict(self.constraint_bound),
+            "nearest_state": None if self.nearest_state is None else self.nearest_state.tolist(),
             "joint_names": list(self.joint_names),
             "held_joints": list(self.held_joints),
             "path": None if self.path is None else self.path.states.tolist(),
@@ -215,17 +232,21 @@ class PlanResult:
         else:
             data = (read_json if path.suffix == ".json" else read_yaml)(path, "result file")
         check_version(data, SCHEMA, path)
-        older = {
+        older: dict[str, Any] = {
             "clearance_pair": ["", ""],
             "timing_method": "",
             "held_joints": [],
             "robot_digest": "",
             "dynamic_obstacles": [],
+            "constraint_violation": {},
+            "constraint_bound": {},
+            "nearest_state": None,
         }
         data = dict.fromkeys(PROOF) | older | data  # older files lack some
         try:
             states = None if data["path"] is None else finite_array(data["path"], "path")
             number = {k: float("nan") if data[k] is None else float(finite_array(data[k], k)) for k in NUMBERS}
+            nearest = data["nearest_state"]
             knots, names = data["trajectory"], tuple(data["joint_names"])
             arrays = {} if knots is None else {key: np.array(knots[key], dtype=float) for key in KNOTS}
             found = cls(
@@ -238,7 +259,10 @@ class PlanResult:
                 timing_method=str(data["timing_method"]), checks=int(data["checks"]), solved_by=data["solved_by"],
                 notes=tuple(data["notes"]), held_joints=tuple(data["held_joints"]),
                 robot_digest=str(data["robot_digest"]), dynamic_obstacles=tuple(map(str, data["dynamic_obstacles"])),
-                clearance_pair=tuple(data["clearance_pair"]), **number,
+                clearance_pair=tuple(data["clearance_pair"]),
+                constraint_violation=finite_numbers(data["constraint_violation"], "constraint_violation"),
+                constraint_bound=finite_numbers(data["constraint_bound"], "constraint_bound"),
+                nearest_state=None if nearest is None else finite_array(nearest, "nearest_state"), **number,
             )  # fmt: skip
             check_plan(
                 found.problem, robot=found.robot, joint_names=names, status=str(found.status), path=states,
@@ -290,6 +314,8 @@ def _summary(result: PlanResult) -> Summary:
         )
         uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
         rows += [("motion", motion), ("limits", f"{uses} used")]
+    for name, bound in result.constraint_bound.items():
+        rows.append(("constraint", f"{name}, violated by at most {bound:.3g}"))
     if result.dynamic_obstacles:
         rows.append(("obstacles", f"proved apart from {', '.join(result.dynamic_obstacles)} in time"))
     rows.append(("checks", f"{result.checks} states checked, planner {result.planner}, seed {result.seed}"))

@@ -11,6 +11,8 @@ from ompl import base as ob
 
 from apex_ompl.apex.models import make_query, rough_kernel
 from apex_ompl.apex.path_validator import PathValidator
+from apex_ompl.constraints.paths import ConstrainedPaths
+from apex_ompl.constraints.proof import prove_path
 from apex_ompl.ompl.own_planner import SolveReport
 from apex_ompl.paths.candidates import Candidate, CandidatePool
 from apex_ompl.paths.optimizer import Optimizer
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
     from apex_ompl.apex.models import ProposalSampler
     from apex_ompl.apex.stages.trees import OmplTrees
+    from apex_ompl.kernel.constraints import ConstrainedTreePair
     from apex_ompl.kernel.search import SearchCounts, TreePair
     from apex_ompl.model.query import Query
 
@@ -58,6 +61,9 @@ class SolveContext:
         all_trees: Compiled trees for all starts and goals, or None.
         all_ompl_trees: OMPL's for all starts and goals, or None.
         grown: Trees between starts and goals so far, for OMPL's planner data.
+        constrained: Makes paths on the constraints along the path, or None where there are none.
+        constrained_trees: Trees on the constraints that have not met, or None.
+        tree_nodes: Nodes of the path that such trees found last, shape (N, dof), or None.
     """
 
     def __init__(
@@ -86,6 +92,14 @@ class SolveContext:
         self.all_trees: TreePair | None = None
         self.all_ompl_trees: OmplTrees | None = None
         self.grown: list[TreePair | og.RRTConnect] = []
+        self.constrained: ConstrainedPaths | None = None
+        if validator.constraints is not None:
+            self.constrained = ConstrainedPaths(
+                self.kernel, validator.constraints, optimizer, lambda states: validator.is_valid(states, self.stop),
+                self.stop,
+            )  # fmt: skip
+        self.constrained_trees: ConstrainedTreePair | None = None
+        self.tree_nodes: Array | None = None
         self._queries: list[Query] = []
 
     @property
@@ -111,6 +125,9 @@ class SolveContext:
 
     def is_valid(self, states: Array) -> bool:
         """Whether a path, shape (N, dof), passes the full check."""
+        constraints = self.validator.constraints
+        if constraints is not None and not prove_path(constraints, states):
+            return False
         return self.validator.is_valid(states, self.stop)
 
     def new_pool(self) -> CandidatePool:

@@ -147,6 +147,19 @@ class ApexParameters(Parameters):
         found.append(stages.TakeTurns(trees, tuple((*one, *ends) for one in rounds)))
         return found
 
+    def constrained_stages(self) -> list[Stage]:
+        """Return the stages of ``solve`` under constraints along the path, up to the first valid path."""
+        from apex_ompl.apex import stages
+
+        found: list[Stage] = []
+        if self.sprints:
+            found.append(stages.ConstrainedTrees(self.sprint))
+        if self.line:
+            found.append(stages.ConstrainedLines())
+        found += [stages.ConstrainedProposals(count) for count in self.batches[:1]]
+        found.append(stages.ConstrainedTurns(self.fallback, max(self.batches, default=0)))
+        return found
+
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
         """Return the planner.
 

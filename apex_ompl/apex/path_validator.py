@@ -10,6 +10,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.simple_setup import SpaceInformation
@@ -40,6 +41,7 @@ class PathValidator:
         checker: Collision checker of the robot, among its obstacles where they are known.
         knows_obstacles: Whether the obstacles are known.
         exclusive: Whether this project's checker alone decides.
+        constraints: Constraints along paths, of this project's checker, or None where there are none.
     """
 
     def __init__(self, si: ob.SpaceInformation, robot: str = "") -> None:
@@ -62,8 +64,9 @@ class PathValidator:
         plain = type(motions) in PLAIN
         self.si = si if plain else forwarding(si, walks=True)
         self.knows_obstacles = isinstance(validity_checker, StateValidityChecker)
+        self.constraints: ConstraintSet | None = None
         if isinstance(validity_checker, StateValidityChecker):
-            self.checker = validity_checker.checker
+            self.checker, self.constraints = validity_checker.checker, validity_checker.constraints
             self.exclusive = type(validity_checker).isValid is StateValidityChecker.isValid and plain
         else:
             self.checker, self.exclusive = CollisionChecker(_robot_of(si, robot)), False

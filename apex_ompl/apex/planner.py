@@ -16,7 +16,7 @@ from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.models import Model, ProposalSampler, make_query, trajectory_model
 from apex_ompl.apex.parameters import AUTO, NAME, ApexKeywords, ApexParameters
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.stages import Anytime, Shorten, Solution, Stage, run_stage
+from apex_ompl.apex.stages import Anytime, ConstrainedShorten, Shorten, Solution, Stage, run_stage
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.search import TreePair, shortcut
 from apex_ompl.ompl.own_planner import (
@@ -74,6 +74,7 @@ class APEX(OwnPlanner):
         super().__init__(si, NAME)
         given = self.parameters = (parameters or ApexParameters()).changed(**values)
         self.stages = given.stages() if stages is None else list(stages)
+        self._constrained_stages = given.constrained_stages() if stages is None else self.stages
         self.validator = PathValidator(si, "" if given.robot == AUTO else given.robot)
         robot = self.validator.checker.robot.name
         self.model = trajectory_model(self.parameters.model, robot, self.parameters.device)
@@ -138,7 +139,7 @@ class APEX(OwnPlanner):
             status, reason = _read_query(context)
             if reason:
                 return _unsolved(context, status, reason)
-            for stage in self.stages:
+            for stage in self.stages if context.constrained is None else self._constrained_stages:
                 found = run_stage(stage, context)
                 if found is not None:
                     self._accept(context, found)
@@ -157,6 +158,10 @@ class APEX(OwnPlanner):
         parameters = self.parameters
         context.report.solved_by = found.stage
         context.accept(found.path)
+        if context.constrained is not None:
+            if parameters.polish or parameters.anytime:
+                ConstrainedShorten(parameters.first, parameters.anytime).run(context)
+            return
         if parameters.polish:
             Shorten(parameters.range if parameters.fallback else None).run(context)
         Anytime(parameters.anytime).run(context)

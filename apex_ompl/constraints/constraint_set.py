@@ -1,17 +1,18 @@
 """Constraints along a path as residuals, the violation of states, and projection onto the constraints.
 
-A record of :mod:`apex_ompl.scene.constraints` becomes one or more groups of rows of the kernel, each with its tolerance:
+A record of :mod:`apex_ompl.scene.constraints` becomes one or more groups of rows of the kernel, each with a tolerance:
 POSITION (coordinates of a frame's origin in another frame), AXIS (the angle between two axes) and ROTATION (the angle
-between two frames). It holds where |r| <= tolerance for each of its groups. Constraints of a user's own are evaluated in
-Python.
+between two frames). It holds where |r| <= tolerance for each of its groups. Constraints of a user's own are evaluated
+in Python.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from apex_ompl.constraints.frames import frame_of
@@ -19,6 +20,7 @@ from apex_ompl.constraints.links import Links
 from apex_ompl.constraints.user import UserConstraint, check_user_constraint
 from apex_ompl.errors import ConstraintError
 from apex_ompl.kernel.constraints import AXIS, POSITION, ROTATION, ConstraintGroup, ConstraintRows, JointFrame
+from apex_ompl.kernel.products import cholesky, product, solve
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
 from apex_ompl.scene.constraints import (
@@ -27,7 +29,6 @@ from apex_ompl.scene.constraints import (
     FixedOrientation,
     OnLine,
     OnPlane,
-    Pose,
     RelativePose,
     ToolRegion,
     Upright,
@@ -40,9 +41,20 @@ EDGE = 0.02  # largest distance between the dead zone of a region and its bounds
 HALF_SPACE = 10.0  # half the width that stands for that of a region with one bound along an axis [m]
 EXACT = 1e-3  # tolerance up to which a region has no dead zone [m]
 ROUNDING = 1e-12  # in units of a tolerance
-NEWTON_STEPS, NEWTON_END = 20, 1e-9  # most steps, and the |r| to stop at, with constraints of a user's own
-ATTEMPTS = 100  # random states from which contradictions are looked for
+STEPS, MANY_STEPS = 20, 60  # most steps of Newton's method: of a projection, and where contradictions are looked for
+NEWTON_END = 1e-9  # |r| at which it stops with constraints of a user's own
+DAMPING = 1e-10  # of the normal equations of these steps
+BATCH, BATCHES, USER_BATCHES = (
+    50,
+    10,
+    2,
+)  # states around the start, and random ones, where contradictions are looked for
+SPREAD = 0.3  # standard deviation of states around the start [rad]
 AXES = ("x", "y", "z")
+
+
+Residual = Callable[[Array], tuple[Array, Array]]
+"""Returns rows at a state, shape (m,), and their Jacobian, shape (m, dof)."""
 
 
 class Part(NamedTuple):
@@ -187,66 +199,75 @@ class ConstraintSet:
 
     def fault(self, q: ArrayLike) -> str:
         """Return a sentence on the constraint that a state, shape (dof,), violates most; empty if it satisfies all."""
-        groups, user = self._norms(q)
-        relative = np.concatenate([groups[0] / self._part_tolerances, user[0] / self._user_tolerances])
-        if not len(relative) or (relative <= 1.0 + ROUNDING).all():
-            return ""
-        worst = int(np.argmax(np.where(np.isnan(relative), np.inf, relative)))
-        if worst < len(self._parts):
-            return f"{self.names[self._owners[worst]]}: {self._parts[worst].fault(float(groups[0, worst]))}"
-        u = worst - len(self._parts)
-        name = self.names[self._user_owners[u]]
-        return f"{name}: the residual is {user[0, u]:.4g}, expected at most {self._user_tolerances[u]:.4g}"
+        name, clause = self._worst(q)
+        return f"{name}: {clause}" if clause else ""
 
-    def project(self, states: ArrayLike) -> Projected:
+    def project(self, states: ArrayLike, steps: int = STEPS) -> Projected:
         """Move states, shape (N, dof), onto the constraints by Newton's method, inside the limits.
 
-        Inequalities end inside of their dead zones.
+        Inequalities end inside of their dead zones. There are at most ``steps`` steps.
         """
         q = self._states(states)
         if self.user:
-            found = [self._newton(row) for row in q]
+            found = [self.newton(row, steps=steps) for row in q]
             ends = np.array([end for end, _ in found]).reshape(q.shape)
             arrived = np.array([there for _, there in found], bool)
         elif self.rows is not None:
-            ends, arrived = self.rows.project(q)
+            ends, arrived = self.rows.project(q, steps=steps)
         else:
             ends = np.clip(q, self.robot.limits.lower, self.robot.limits.upper)
             arrived = np.ones(len(q), bool)
         return Projected(ends, arrived & self._satisfied(ends))
 
-    def check(self, attempts: int = ATTEMPTS) -> None:
-        """Look for a state that satisfies the constraints: from the start and from random states, always the same.
+    def check(self, seed: int = 0) -> None:
+        """Look for a state that satisfies the constraints, from the start, around it and from random states.
 
         Raises:
-            ConstraintError: None of the attempts ends at one; the message names the constraint that fails alone, else
-                those that contradict each other.
+            ConstraintError: None was found; the message names the constraint that fails alone, else all of them.
         """
-        states = np.vstack([self.start, self.robot.random_state(np.random.default_rng(0), attempts)])
-        states[:, list(self.fixed)] = self.start[list(self.fixed)]
-        if self.project(states).ok.any():
+        found, _, _ = self._search(seed)
+        if found:
             return
+        text = "no state within the limits was found that satisfies"
         for name, member in zip(self.names, self._members, strict=True):
-            alone = ConstraintSet(self.robot, [member], self.start, self.fixed)
-            best, fault = alone._nearest(states)
-            if not best:
-                raise ConstraintError(name, f"no state within the limits satisfies it; at the nearest one, {fault}")
-        if len(self) > 1:
-            _, fault = self._nearest(states)
-            raise ConstraintError(
-                ", ".join(self.names),
-                f"no state within the limits satisfies all of them; at the nearest one, {fault}",
-            )
+            alone, _, clause = ConstraintSet(self.robot, [member], self.start, self.fixed)._search(seed)
+            if not alone:
+                raise ConstraintError(name, f"{text} it; at the nearest one, {clause}")
+        _, name, clause = self._search(seed)
+        raise ConstraintError(", ".join(self.names), f"{text} all of them; at the nearest one, {name}: {clause}")
 
-    def _nearest(self, states: Array) -> tuple[bool, str]:
-        """Return whether one state can be moved onto the constraints, and the fault of the nearest end."""
-        ends, ok = self.project(states)
-        relative = (self.violations(ends) / self.tolerances).max(axis=1)
-        return bool(ok.any()), self.fault(ends[int(np.argmin(np.where(np.isnan(relative), np.inf, relative)))])
+    def _search(self, seed: int) -> tuple[bool, str, str]:
+        """Return whether a state was found that satisfies the constraints, else what is worst at the nearest one."""
+        rng, nearest, least = np.random.default_rng(seed), self.start, np.inf
+        lower, upper = self.robot.limits.lower, self.robot.limits.upper
+        for _ in range(USER_BATCHES if self.user else BATCHES):
+            around = np.clip(self.start + SPREAD * rng.normal(size=(BATCH, len(lower))), lower, upper)
+            states = np.vstack([self.start, around, self.robot.random_state(rng, BATCH)])
+            states[:, list(self.fixed)] = self.start[list(self.fixed)]
+            ends, ok = self.project(states, MANY_STEPS)
+            if ok.any():
+                return True, "", ""
+            relative = (self.violations(ends) / self.tolerances).max(axis=1)
+            k = int(np.argmin(np.where(np.isnan(relative), np.inf, relative)))
+            if relative[k] < least:
+                nearest, least = ends[k], float(relative[k])
+        return False, *self._worst(nearest)
+
+    def _worst(self, q: ArrayLike) -> tuple[str, str]:
+        """Return the name of the constraint that a state violates most, and a clause on it; two empty texts if none."""
+        groups, user = self._norms(q)
+        relative = np.concatenate([groups[0] / self._part_tolerances, user[0] / self._user_tolerances])
+        if not len(relative) or (relative <= 1.0 + ROUNDING).all():
+            return "", ""
+        worst = int(np.argmax(np.where(np.isnan(relative), np.inf, relative)))
+        if worst < len(self._parts):
+            return self.names[self._owners[worst]], self._parts[worst].fault(float(groups[0, worst]))
+        u = worst - len(self._parts)
+        clause = f"the residual is {user[0, u]:.4g}, expected at most {self._user_tolerances[u]:.4g}"
+        return self.names[self._user_owners[u]], clause
 
     def _satisfied(self, states: Array) -> Flags:
-        satisfied: Flags = (self.violations(states) <= self.tolerances * (1.0 + ROUNDING)).all(axis=1)
-        return satisfied
+        return np.asarray((self.violations(states) <= self.tolerances * (1.0 + ROUNDING)).all(axis=1), bool)
 
     def _norms(self, states: ArrayLike) -> tuple[Array, Array]:
         """Return |r| of groups and of a user's own constraints at states, shapes (N, G) and (N, U)."""
@@ -258,45 +279,54 @@ class ConstraintSet:
     def _states(self, states: ArrayLike) -> Array:
         return np.array(states, float, ndmin=2)
 
-    def _newton(self, q: Array) -> tuple[Array, bool]:
+    def newton(self, q: Array, also: Residual | None = None, *, steps: int = STEPS) -> tuple[Array, bool]:
         """Return the end of Newton's method with the pseudoinverse from a state, and whether it arrived.
 
         A joint that a step takes beyond a limit stays out of the next step.
+
+        Args:
+            q: The state, shape (dof,).
+            also: Further rows, such as those of a goal, and their Jacobian.
+            steps: Most steps.
         """
         lower, upper = self.robot.limits.lower, self.robot.limits.upper
         q, free = np.clip(q, lower, upper), np.ones(len(q), bool)
-        for step in range(NEWTON_STEPS + 1):
-            r, jacobian = self._residual(q)
+        for step in range(steps + 1):
+            r, jacobian = self.residual(q, also)
             if length(r) <= NEWTON_END:
                 return q, True
-            if step == NEWTON_STEPS or not np.isfinite(r).all() or not np.isfinite(jacobian).all():
+            if step == steps or not np.isfinite(r).all() or not np.isfinite(jacobian).all():
                 break
-            moved = q - np.linalg.lstsq(jacobian * free, r)[0]
+            j = jacobian * free
+            factor = cholesky(product(j, j.T) + DAMPING * np.eye(len(r)))
+            if not np.isfinite(factor).all():
+                break
+            moved = q - product(j.T, solve(factor, r[:, None]))[:, 0]
             q = np.clip(moved, lower, upper)
-            free = (q == moved) | ~free
+            free = q == moved
         return q, self.is_satisfied(q)
 
-    def _residual(self, q: Array) -> tuple[Array, Array]:
-        """Return the rows outside of dead zones, shape (m,), and their Jacobian, shape (m, dof)."""
+    def residual(self, q: Array, also: Residual | None = None) -> tuple[Array, Array]:
+        """Return the rows outside of dead zones, shape (m,), and their Jacobian, shape (m, dof); see :meth:`newton`."""
         rows = [] if self.rows is None else [self.rows.residual(q, 1.0)]
         for one in self.user:
-            r, jacobian = np.array(one.residual(q.copy()), float), np.array(one.jacobian(q.copy()), float)
+            rows.append((np.array(one.residual(q.copy()), float), np.array(one.jacobian(q.copy()), float)))
+        rows += [] if also is None else [also(q)]
+        for _, jacobian in rows:
             jacobian[:, list(self.fixed)] = 0.0
-            rows.append((r, jacobian))
         return np.concatenate([r for r, _ in rows]), np.vstack([jacobian for _, jacobian in rows])
 
 
 class _Placed(NamedTuple):
-    """A frame: its name, joint, pose in the joint's frame and pose in the world at the start, shapes (4, 4)."""
+    """A frame: its joint, its pose in the joint's frame, and in the world at the start [m]."""
 
-    name: str
     joint: int
-    pose: Array
-    start: Array
+    pose: pin.SE3
+    start: pin.SE3
 
     def turned(self, turn: Array) -> JointFrame:
         """Return the frame with its axes turned by a rotation in its own frame, shape (3, 3)."""
-        return JointFrame(self.joint, self.pose[:3, :3] @ turn, self.pose[:3, 3])
+        return JointFrame(self.joint, product(self.pose.rotation, turn), self.pose.translation.copy())
 
 
 class _Tables:
@@ -333,7 +363,11 @@ class _Tables:
 
     def _relative_pose(self, c: RelativePose) -> Member:
         first, second = self._frame(c.first, or_world=True), self._frame(c.second)
-        pose = np.linalg.inv(first.start) @ second.start if c.pose is None else _matrix(c.pose)
+        pose = (
+            first.start.actInv(second.start)
+            if c.pose is None
+            else pin.SE3(pose_matrix(c.pose.position, c.pose.orientation))
+        )
         parts = []
         kept = [k for k in range(3) if AXES[k] not in c.free]
         if kept:
@@ -341,29 +375,29 @@ class _Tables:
             order = next(shift for shift in ([0, 1, 2], [1, 2, 0], [2, 0, 1]) if sorted(shift[: len(kept)]) == kept)
             frames = first.turned(np.eye(3)[:, order]), second.turned(np.eye(3))
             group = ConstraintGroup(
-                POSITION, len(kept), *frames, tolerance=c.tolerance.position, value=pose[:3, 3][order]
+                POSITION, len(kept), *frames, tolerance=c.tolerance.position, value=pose.translation[order]
             )
             parts.append(Part(group, "distance"))
         turns = [k for k in range(3) if f"r{AXES[k]}" in c.free]
         if not turns:
-            frames = first.turned(pose[:3, :3]), second.turned(np.eye(3))
+            frames = first.turned(pose.rotation), second.turned(np.eye(3))
             parts.append(Part(ConstraintGroup(ROTATION, 3, *frames, tolerance=c.tolerance.angle), "angle"))
         elif len(turns) == 1:
             axis = _with_last(np.eye(3)[turns[0]])
-            frames = first.turned(pose[:3, :3] @ axis), second.turned(axis)
+            frames = first.turned(product(pose.rotation, axis)), second.turned(axis)
             parts.append(Part(ConstraintGroup(AXIS, 2, *frames, tolerance=c.tolerance.angle), "angle"))
         return self._checked(f"pose of {c.second} in {c.first}", parts)
 
     def _on_axes(self, what: str, c: OnPlane | OnLine, turn: Array, rows: int) -> Member:
         """Return a constraint to a point along the first ``rows`` axes of ``turn``."""
         frame = self._frame(c.frame)
-        point = frame.start[:3, 3] if c.point is None else np.array(c.point)
+        point = frame.start.translation if c.point is None else np.array(c.point)
         group = ConstraintGroup(POSITION, rows, _in_world(turn, point), frame.turned(np.eye(3)), tolerance=c.tolerance)
         return self._checked(f"{what} of {c.frame}", [Part(group, "distance")])
 
     def _fixed_orientation(self, c: FixedOrientation) -> Member:
         frame = self._frame(c.frame)
-        wanted = frame.start[:3, :3] if c.orientation is None else _rotation(c.orientation)
+        wanted = frame.start.rotation if c.orientation is None else _rotation(c.orientation)
         group = ConstraintGroup(ROTATION, 3, _in_world(wanted), frame.turned(np.eye(3)), tolerance=c.angle)
         return self._checked(f"orientation of {c.frame}", [Part(group, "angle")])
 
@@ -390,10 +424,10 @@ class _Tables:
 
     def _frame(self, name: str, or_world: bool = False) -> _Placed:
         if or_world and name == WORLD:
-            return _Placed(name, 0, np.eye(4), np.eye(4))
+            return _Placed(0, pin.SE3.Identity(), pin.SE3.Identity())
         frame = frame_of(self.robot, name, self.held, "frame of a constraint")
-        joint, pose = self.links.frame(frame.link, frame.pose)
-        return _Placed(name, joint, pose, self.robot.link_pose(self.start, frame.link) @ frame.pose)
+        joint, pose = self.links.frame(frame.link, pin.SE3(frame.pose))
+        return _Placed(joint, pose, pin.SE3(self.robot.link_pose(self.start, frame.link)) * pin.SE3(frame.pose))
 
     def _checked(self, name: str, parts: Sequence[Part]) -> Member:
         for part in parts:
@@ -415,10 +449,6 @@ def _told_apart(names: Sequence[str]) -> tuple[str, ...]:
 
 def _in_world(rotation: Array, point: Array | None = None) -> JointFrame:
     return JointFrame(0, rotation, np.zeros(3) if point is None else point)
-
-
-def _matrix(pose: Pose) -> Array:
-    return pose_matrix(pose.position, pose.orientation)
 
 
 def _rotation(orientation: Sequence[float]) -> Array:

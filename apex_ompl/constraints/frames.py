@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.errors import UnknownNameError
+from apex_ompl.kernel.products import product
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import WorldVector
@@ -110,6 +111,5 @@ def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject], role: 
 def _turned(axes: Array, axis: Array) -> Array:
     """Return axes, shape (3, 3), turned so that the last one is a unit axis, shape (3,)."""
     if 1.0 + float((axes[:, 2] * axis).sum()) < OPPOSITE:
-        return axes * np.array([1.0, -1.0, -1.0])
-    turned: Array = pin.Quaternion.FromTwoVectors(axes[:, 2], axis).matrix() @ axes
-    return turned
+        return np.array(axes * (1.0, -1.0, -1.0))
+    return product(pin.Quaternion.FromTwoVectors(axes[:, 2], axis).matrix(), axes)

@@ -14,7 +14,6 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import FixedVector, IKSolver, RobotTables, Target
 from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.robot import Robot
-from apex_ompl.types import Array
 from apex_ompl.util.forking import ProcessLock
 
 
@@ -68,15 +67,14 @@ class Links:
         joint, placement = self._placement(link)
         return FixedVector(joint, self._turns[joint].T @ placement.rotation @ np.asarray(direction, float))
 
-    def frame(self, link: str, pose: Array) -> tuple[int, Array]:
-        """Return the joint of a frame given in that of a link, and its pose in the joint's frame, shapes (4, 4) [m].
+    def frame(self, link: str, pose: pin.SE3) -> tuple[int, pin.SE3]:
+        """Return the joint of a frame given in that of a link, and its pose in the joint's frame [m].
 
         Raises:
             UnknownNameError: No such link.
         """
         joint, placement = self._placement(link)
-        placed = pin.SE3(self._turns[joint].T, np.zeros(3)) * placement * pin.SE3(pose[:3, :3], pose[:3, 3])
-        return joint, np.array(placed.homogeneous)
+        return joint, pin.SE3(self._turns[joint], np.zeros(3)).actInv(placement * pose)
 
     def moved(self, first: int, second: int = 0) -> tuple[int, ...]:
         """Return the planned joints that move one joint's frame relative to another's, the world's by default."""

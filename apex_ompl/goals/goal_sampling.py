@@ -16,6 +16,7 @@ from typing import Protocol
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.goals.alignment import within
 from apex_ompl.kernel import IKDescents, IKSolver
 from apex_ompl.robot import Robot
@@ -48,6 +49,9 @@ ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares o
 DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
 SHORTEST = 0.05  # least duration for which the reach is computed [s]
 PULL = 0.3  # largest share of the way to the start
+
+
+ON_CONSTRAINTS = "constraints"  # error term of a goal of which no state on the constraints was found
 
 
 class WorkspaceGoal(Protocol):
@@ -96,6 +100,8 @@ class GoalSamples:
         """Reason for which there is no state, in one sentence; empty when there is one."""
         if len(self.states):
             return ""
+        if ON_CONSTRAINTS in self.best:
+            return f"no state at the goal on the constraints was found in {self.attempts} attempts"
         if self.converged:
             return f"all {self.converged} states found at the goal in {self.attempts} attempts collide, {self.blocked}"
         best = ", ".join(f"{name} {value:.3g} {unit_of(name)} off" for name, value in self.best.items())
@@ -146,6 +152,44 @@ def sample(
     if search.colliding is not None and not len(states):
         blocked = str(next(iter(checker.contacts(search.colliding)), "in collision"))
     return GoalSamples(states, attempts, converged, best, blocked)
+
+
+def sample_on_constraints(
+    goal: WorkspaceGoal, constraints: ConstraintSet, checker: CollisionChecker, rng: np.random.Generator,
+    *, known: GoalSamples, count: int = 8, max_attempts: int = 200,
+) -> GoalSamples:  # fmt: skip
+    """Sample free states that reach a goal and satisfy constraints along the path, the nearest to the start first.
+
+    States of the goal, and random ones, are moved by Newton's method on the residuals of both together.
+
+    Args:
+        goal: The goal.
+        constraints: The constraints.
+        checker: Checks the states for collision.
+        rng: Source of random numbers.
+        known: States of the goal, from which it begins.
+        count: Most states to return.
+        max_attempts: Most random states.
+    """
+    search, found, attempts, converged = _Search(goal, checker, rng), list[Array](), 0, 0
+    states, blocked = known.states, ""
+    while True:
+        for q in states:
+            end, arrived = constraints.newton(q, goal.inverse.residual)
+            if arrived and within(goal.errors(end), goal.bounds) and constraints.is_satisfied(end):
+                converged += 1
+                if checker.is_free(end):
+                    found.append(end)
+                else:
+                    blocked = str(next(iter(checker.contacts(end)), "in collision"))
+        if len(found) >= count or attempts >= max_attempts or (found and attempts >= FEW):
+            break
+        states = search.first_states(BATCH, around_home=attempts > 0)
+        states = search.descended(states, DESCENT_STEPS).states
+        attempts += BATCH
+    near = search.nearest(np.array(found).reshape(-1, len(search.start)), count, NEAR)
+    best = known.best if converged else {**known.best, ON_CONSTRAINTS: math.inf}
+    return GoalSamples(near, known.attempts + attempts, converged, best, blocked)
 
 
 class _Search:

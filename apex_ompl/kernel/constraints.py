@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled.arrays import FIXED
-from apex_ompl.kernel.compiled.constraint import path_optimization, projection, search
+from apex_ompl.kernel.compiled.constraint import path_optimization, projection, proof, search
 from apex_ompl.kernel.compiled.constraint.rows import AXIS, POSITION, ROTATION, ConstraintArrays, RowBuffers
 from apex_ompl.kernel.compiled.layout import Floats, Integers, new_buffers, pack
 from apex_ompl.kernel.compiled.path.path_cost import CostSettings, PathReport
 from apex_ompl.kernel.compiled.workspace import workspace_sizes
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.path import PathGrid
-from apex_ompl.kernel.search import TreePair
+from apex_ompl.kernel.search import SearchBuffers, SearchCounts, TreePair
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
@@ -30,13 +31,18 @@ __all__ = [
     "ROTATION",
     "ConstrainedTreePair",
     "ConstraintGroup",
+    "ConstraintProof",
     "ConstraintRows",
     "JointFrame",
+    "ManifoldConnection",
     "optimize_constrained_path",
+    "prove_motion",
+    "prove_path",
 ]
 
 MOST_ROWS = {POSITION: 3, AXIS: 2, ROTATION: 3}
 LONGEST, PIECES = 0.15, 2  # of an edge of trees [rad], and its chords
+MOST_EDGES = 200  # of a connection
 AT_ONCE = 8  # random states between two looks at the clock
 ORTHOGONAL = 1e-6
 
@@ -289,3 +295,115 @@ class ConstrainedTreePair(TreePair):
 
     def _advance(self, samples: Array) -> int:
         return int(search.grow_constrained_trees(*self._arguments(samples), *self._constrained))
+
+
+class ManifoldConnection:
+    """Connections of states on the manifold of constraints, in edges as trees have them."""
+
+    def __init__(
+        self, kernel: Kernel, rows: ConstraintRows, resolution: float, longest: float = LONGEST, pieces: int = PIECES
+    ) -> None:  # fmt: skip
+        """Connect states; arguments as of :class:`ConstrainedTreePair`."""
+        self._kernel, self._resolution, self._longest = kernel, resolution, longest
+        self._buffers = SearchBuffers(kernel, 2.0 * longest, resolution)
+        self._constrained = *rows.packed, int(pieces), rows.rows, *rows.buffers(), np.empty((2, kernel.robot.dof))
+
+    def between(self, first: Array, last: Array, most: int = MOST_EDGES) -> Array | None:
+        """Return states from one to another, shape (N, dof), or None where the way by projected steps does not arrive.
+
+        Args:
+            first: The first state, shape (dof,).
+            last: The last state, shape (dof,).
+            most: Largest number of edges.
+        """
+        nodes, target = np.empty((most, len(first))), np.array(last)
+        count = search.connect_states(
+            *self._kernel.packed, *self._buffers.workspace, compact(first), self._longest, self._resolution, target,
+            nodes, *self._buffers.proof, *self._constrained,
+        )  # fmt: skip
+        return None if count < 0 else np.concatenate([first[None], nodes[:count]])
+
+    def take_counts(self) -> SearchCounts:
+        """Return the counts since the last call."""
+        return self._buffers.take_counts()
+
+
+@dataclass(frozen=True, eq=False)
+class ConstraintProof:
+    """Whether G groups hold along a whole curve, see :mod:`apex_ompl.kernel.compiled.constraint.proof`.
+
+    Attributes:
+        proved: Whether |r| <= tolerance holds for all of them.
+        bounds: Proved upper bounds on their largest |r|, shape (G,) [m, rad]; infinite where it is not proved.
+        violations: Their largest |r| at the states that were examined, shape (G,).
+        intervals: Number of intervals that were examined.
+        piece: Piece between states ``piece`` and ``piece + 1`` at which the proof failed, or -1.
+        share: Place on that piece, from 0 to 1.
+        group: Group that failed there; -1 where it did not, or where the piece has no numbers.
+        value: Its |r| there; where that is within the tolerance, it is so near to it that bisection did not end.
+    """
+
+    proved: bool
+    bounds: Array
+    violations: Array
+    intervals: int
+    piece: int = -1
+    share: float = math.nan
+    group: int = -1
+    value: float = math.nan
+
+
+def prove_path(rows: ConstraintRows, states: ArrayLike) -> ConstraintProof:
+    """Prove that constraints hold along straight lines between states; what has no finite numbers is not proved.
+
+    Args:
+        rows: The constraints.
+        states: One or more states, shape (N, dof).
+
+    Raises:
+        ParameterError: Another shape.
+    """
+    q = compact(states)
+    if q.ndim != 2 or q.shape[1] != rows.robot.dof or len(q) == 0:
+        raise shape_error(q, ("N", rows.robot.dof), "states")
+    none = np.empty((0, rows.robot.dof))
+    return _proof(rows, np.empty(0), q, none, none)
+
+
+def prove_motion(
+    rows: ConstraintRows, times: ArrayLike, positions: ArrayLike, velocities: ArrayLike, accelerations: ArrayLike
+) -> ConstraintProof:
+    """Prove that constraints hold along a motion of constant jerk between knots.
+
+    Gaps between the end of a piece and the knot there are counted in. What has no finite numbers, or times that
+    decrease, is not proved.
+
+    Args:
+        rows: The constraints.
+        times: Times of the knots, one or more, shape (K,) [s].
+        positions: At them, shape (K, dof).
+        velocities: At them.
+        accelerations: At them.
+
+    Raises:
+        ParameterError: Another shape.
+    """
+    knots, states = compact(times), tuple(compact(one) for one in (positions, velocities, accelerations))
+    if knots.ndim != 1 or len(knots) == 0:
+        raise shape_error(knots, ("K",), "times")
+    for one, name in zip(states, ("positions", "velocities", "accelerations"), strict=True):
+        if one.shape != (len(knots), rows.robot.dof):
+            raise shape_error(one, (len(knots), rows.robot.dof), name)
+    return _proof(rows, knots, *states)
+
+
+def _proof(rows: ConstraintRows, *curve: Array) -> ConstraintProof:
+    integers, floats, b = new_buffers(proof.ConstraintProofBuffers, groups=len(rows.groups), dof=rows.robot.dof)
+    outcome = proof.prove_constraints(*rows._head(), *curve, *rows.buffers(), rows.rows, integers, floats)
+    (intervals, piece, group), violations = b.counts.tolist(), b.violations.copy()
+    if outcome == proof.PROVED:
+        return ConstraintProof(True, b.bounds.copy(), violations, intervals)
+    return ConstraintProof(
+        False, np.full(len(rows.groups), np.inf), violations, intervals, piece, float(b.figures[0]), group,
+        float(b.figures[1]),
+    )  # fmt: skip

@@ -11,14 +11,17 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.constraint_set import ConstraintSet
+from apex_ompl.constraints.user import UserConstraint
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
-from apex_ompl.goals.goal_sampling import sample
+from apex_ompl.goals.goal_sampling import sample, sample_on_constraints
 from apex_ompl.goals.pose_goal import PoseGoal
 from apex_ompl.ompl.simple_setup import SimpleSetup
 from apex_ompl.ompl.space import Bounds, to_state
 from apex_ompl.ompl.validity import MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
@@ -48,6 +51,9 @@ class PlanningSetup:
             in the workspace that was not reached, why.
         alignment: The alignment goal, or None.
         held: Numbers of the joints that stay as at the start.
+        constraints: Constraints along the path, or None where there are none.
+        start_off: Which of them the start violates, and by how much, or empty.
+        goals_off: Which of them each goal violates, or empty; those that do are not given to OMPL unless all do.
         seed: Seed of the sampling of goals, and of the plan.
         notes: Sentences on joints of the start and the goals that were moved to their limits, and on meshes that are no
             proper solids, and how they are interpreted.
@@ -66,6 +72,9 @@ class PlanningSetup:
     goal_faults: tuple[str, ...]
     alignment: AlignmentGoal | None
     held: NDArray[np.intp]
+    constraints: ConstraintSet | None
+    start_off: str
+    goals_off: tuple[str, ...]
     seed: int
     notes: tuple[str, ...]
 
@@ -87,13 +96,14 @@ class PlanningSetup:
 
     @property
     def valid_goals(self) -> Array:
-        """The goals that are inside the limits and free, shape (valid, dof)."""
-        return self.goals[[not fault for fault in self.goal_faults[: len(self.goals)]]]
+        """The goals that are inside the limits, free and on the constraints, shape (valid, dof)."""
+        faults = zip(self.goal_faults, self.goals_off, strict=False)
+        return self.goals[[not fault and not off for fault, off in faults][: len(self.goals)]]
 
 
 def assemble(
     problem: Problem, robot: Robot | None = None, seed: int = 0, checker: CollisionChecker | None = None,
-    moving: Sequence[str] | None = None,
+    moving: Sequence[str] | None = None, *, constraints: Sequence[Constraint | UserConstraint] = (),
 ) -> PlanningSetup:  # fmt: skip
     """Make a problem ready for OMPL.
 
@@ -103,6 +113,7 @@ def assemble(
         seed: Seed of the sampling of an alignment goal.
         checker: Collision checker that has the bodies of the problem already.
         moving: Names of the joints that are planned; the others stay as at the start. All by default.
+        constraints: Constraints along the path besides those of the problem.
 
     Raises:
         ApexError: The robot, a mesh or a joint of the problem is unknown or faulty.
@@ -126,22 +137,33 @@ def assemble(
         now = problem_at(problem, 0.0)
         checker = CollisionChecker(robot, now.scene, now.attached, now.allowed)
     checker.prepare()
+    along = constraint_set(robot, problem, constraints, start, held)
     start_fault = state_fault(checker, start)
     goal_faults = tuple(_held_fault(robot, start, goal, held) or state_fault(checker, goal) for goal in goals)
     if sampled is not None and not start_fault:
-        sampling = sample(sampled, checker, np.random.default_rng(seed), GOAL_STATES, GOAL_ATTEMPTS)
+        rng = np.random.default_rng(seed)
+        sampling = sample(sampled, checker, rng, GOAL_STATES, GOAL_ATTEMPTS)
+        if along is not None:
+            sampling = sample_on_constraints(
+                sampled, along, checker, rng, known=sampling, count=GOAL_STATES, max_attempts=GOAL_ATTEMPTS
+            )
         goals = sampling.states
         goals[:, held] = start[held]
         goal_faults = ("",) * len(goals) or (sampling.fault,)
     simple_setup = SimpleSetup(robot, bounds)
     si = simple_setup.getSpaceInformation()
     check = MotionCheck(checker, SEARCH_RESOLUTION)
-    validity_checker = StateValidityChecker(si, checker)
+    validity_checker = StateValidityChecker(si, checker, along)
     motion_validator = MotionValidator(si, check, validity_checker)
     simple_setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motion_validator)
     simple_setup.setStartState(to_state(si, start))
-    given = [goal for goal, fault in zip(goals, goal_faults, strict=False) if not fault]
+    start_off, goals_off = "", ("",) * len(goals)
+    if along is not None:
+        start_off, goals_off = along.fault(start), tuple(along.fault(goal) for goal in goals)
+        if start_off:
+            along.check()
+    given = [goal for goal, fault, off in zip(goals, goal_faults, goals_off, strict=False) if not fault and not off]
     set_goals(simple_setup, given or list(goals))
     return PlanningSetup(
         problem,
@@ -157,9 +179,35 @@ def assemble(
         goal_faults,
         sampled if isinstance(sampled, AlignmentGoal) else None,
         held,
+        along,
+        start_off,
+        goals_off,
         seed,
         (*notes, *checker.mesh_notes),
     )
+
+
+def constraint_set(
+    robot: Robot, problem: Problem, constraints: Sequence[Constraint | UserConstraint], start: Array,
+    held: NDArray[np.intp],
+) -> ConstraintSet | None:  # fmt: skip
+    """Return the constraints of a plan, or None where there are none.
+
+    Args:
+        robot: The robot.
+        problem: The problem; an object that two links hold is a constraint, too.
+        constraints: Further ones.
+        start: The start, shape (dof,).
+        held: Numbers of the joints that stay as at the start.
+
+    Raises:
+        ApexError: A frame is unknown, or no planned joint moves it.
+    """
+    if not (problem.constraints or constraints or any(one.links is not None for one in problem.attached)):
+        return None
+    hands = (hand.synergy for hand in robot.hands.values() if hand.synergy is not None)
+    fixed = sorted({*held.tolist(), *(robot.joint_names.index(name) for name in hands)})
+    return ConstraintSet.of(robot, (*problem.constraints, *constraints), problem.attached, start, fixed)
 
 
 def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[str]:

@@ -15,6 +15,8 @@ from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.path_proof import Curve, PathProof
+from apex_ompl.constraints.constraint_set import ConstraintSet
+from apex_ompl.constraints.proof import ConstraintCertificate, prove_motion, prove_path
 from apex_ompl.ompl.simple_setup import SpaceInformation
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.timing.trajectory import ROUNDING, Trajectory
@@ -55,17 +57,20 @@ class StateValidityChecker(ob.StateValidityChecker):
     kept in ``fault``, without OMPL's states (see ``forget_states``).
     """
 
-    def __init__(self, si: ob.SpaceInformation, checker: CollisionChecker) -> None:
-        """Check states of ``si`` by ``checker``."""
+    def __init__(
+        self, si: ob.SpaceInformation, checker: CollisionChecker, constraints: ConstraintSet | None = None
+    ) -> None:
+        """Check states of ``si`` by ``checker``, and whether they satisfy constraints."""
         super().__init__(si)
-        self.checker = checker
+        self.checker, self.constraints = checker, constraints
         self.dof = checker.robot.dof
         self.fault: BaseException | None = None
 
     def isValid(self, state: Any) -> bool:  # noqa: N802 - OMPL's name
         """Whether the state is free."""
         try:
-            return self.checker.is_free(np.array(state[0 : self.dof]))
+            q = np.array(state[0 : self.dof])
+            return (self.constraints is None or self.constraints.is_satisfied(q)) and self.checker.is_free(q)
         except BaseException as error:
             state = None
             self.fault = self.fault or error
@@ -186,6 +191,7 @@ class FullCheck:
         segment: Index of the segment (states k and k + 1) with the fault, or None.
         proof: The proof, or None where limits or ends are at fault.
         timed_out: Whether the time was over before the path was proved.
+        constraints: Bounds on the violation of constraints along the path, or None without constraints.
     """
 
     ok: bool
@@ -193,6 +199,7 @@ class FullCheck:
     segment: int | None
     proof: PathProof | None = None
     timed_out: bool = False
+    constraints: ConstraintCertificate | None = None
 
     __repr__ = fields_line
 
@@ -208,11 +215,13 @@ def full_check(
     goals: Iterable[Array] = (),
     *,
     deadline: float | None = None,
+    constraints: ConstraintSet | None = None,
 ) -> FullCheck:
     """Decide whether a path or a motion is a solution.
 
     It is one when it stays inside the limits, starts at ``start`` and ends at one of ``goals`` bit for bit, and is
-    proved free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`).
+    proved free from end to end (:meth:`apex_ompl.collision.CollisionChecker.prove`), and to keep constraints
+    (:mod:`apex_ompl.constraints.proof`).
 
     Args:
         checker: Collision checker.
@@ -221,6 +230,7 @@ def full_check(
         start: The given start, shape (dof,), or None for any.
         goals: Goal states; none means any end.
         deadline: Value of ``time.perf_counter`` at which to give up [s].
+        constraints: Constraints along the path, or None for none.
 
     Raises:
         ParameterError: ``path`` has not the shape (N, dof).
@@ -242,12 +252,17 @@ def full_check(
         return FullCheck(False, "the path does not end at a goal", last)
     if deadline is not None and time.perf_counter() >= deadline:
         return FullCheck(False, "not proved in time", None, timed_out=True)
+    kept: ConstraintCertificate | None = None
+    if constraints is not None:
+        kept = prove_path(constraints, states) if motion is None else prove_motion(constraints, motion)
+        if not kept:
+            return FullCheck(False, kept.fault, None, constraints=kept)
     curve = Curve.polyline(states)
     if motion is not None:
         curve = Curve.cubic(motion.times, states, motion.velocities, motion.accelerations)
     proof = checker.prove(curve, deadline=deadline)
     if proof:
-        return FullCheck(True, "", None, proof)
+        return FullCheck(True, "", None, proof, constraints=kept)
     if proof.timed_out:
         return FullCheck(False, proof.reason, None, proof, True)
     contacts = checker.contacts(proof.state) if np.isfinite(proof.state).all() and proof.clearance <= 0.0 else []

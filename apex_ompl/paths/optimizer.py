@@ -209,7 +209,7 @@ class Optimizer:
         for name, number in (("steps", steps), ("stiffness", stiffness), ("damping", damping)):
             if len(control) and number is not None:
                 check_nonnegative(number, name)
-        grid = _grid(self.spline, self.settings.samples)
+        grid = path_grid(self.spline, self.settings.samples)
         settings = self._cost_settings(steps, stiffness, enough)
         dampings = np.broadcast_to(self.settings.damping if damping is None else damping, len(control))
         if self.costs:
@@ -267,7 +267,7 @@ class Optimizer:
     def _evaluate(self, kernel: Kernel, control: Array, settings: CostSettings) -> Evaluation:
         """Return cost, gradient and Gauss-Newton matrix of control points, shape (points, dof), all terms included."""
         samples = self.settings.samples
-        evaluation = path_cost(kernel, _grid(self.spline, samples), self.spline.pinned, control, settings)
+        evaluation = path_cost(kernel, path_grid(self.spline, samples), self.spline.pinned, control, settings)
         if not self.costs:
             return evaluation
         weights = self.spline.basis((np.arange(samples) + 0.5) / samples)
@@ -320,7 +320,7 @@ class Optimizer:
 
 
 @lru_cache(maxsize=32)
-def _grid(spline: Spline, samples: int) -> PathGrid:
+def path_grid(spline: Spline, samples: int) -> PathGrid:
     """Return the nonzero weights at the samples, the first control point of each, and the Gram matrix of the speed."""
     weights = spline.basis((np.arange(samples) + 0.5) / samples)
     width = spline.degree + 1

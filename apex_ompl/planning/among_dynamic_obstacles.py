@@ -244,7 +244,7 @@ def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
     blocked = problem.still.model_copy(update={"scene": (*problem.still.scene, *swept)})
     setup = replace(assemble(blocked, robot, seed=query.setup.seed, moving=names), problem=problem)
     deadline = Deadline(max(1e-3, SWEPT_SHARE * query.deadline.remaining))
-    status, reason = query_fault(setup)
+    status, reason, _ = query_fault(setup)
     inner = replace(query, setup=setup, deadline=deadline, status=status, reason=reason, rejected_lines=[])
     found = time(prove(solve(inner), simplify), among.timing)
     if not found or found.trajectory is None or not among.accepts(found.trajectory):

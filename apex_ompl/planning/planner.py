@@ -24,12 +24,14 @@ if TYPE_CHECKING:
     from ompl import geometric as og
 
     from apex_ompl.collision import CollisionChecker, Contact
+    from apex_ompl.constraints.user import UserConstraint
     from apex_ompl.planners import AnyPlanner
     from apex_ompl.planning.lines import LineResult, Waypoint
     from apex_ompl.planning.query import Group, State, Target
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
     from apex_ompl.scene.bodies import Obstacle
+    from apex_ompl.scene.constraints import Constraint
     from apex_ompl.scene.problem import Problem
     from apex_ompl.timing import Timing
 
@@ -51,6 +53,7 @@ class PlanOptions:
     calm_factor: float = 1.1
     group: Group | None = None
     leave_contact: float = 0.0
+    constraints: Sequence[Constraint | UserConstraint] = ()
 
     def check(self) -> None:
         """Check the values that need no robot.
@@ -86,6 +89,7 @@ class PlanKeywords(TypedDict, total=False):
     objective: str
     calm_factor: float
     leave_contact: float
+    constraints: Sequence[Constraint | UserConstraint]
 
 
 class ProblemKeywords(PlanKeywords, total=False):
@@ -209,7 +213,7 @@ class MotionPlanner:
                 by joint names may leave them out. All by default.
             name: Name of the problem in the result.
             **options: As of :func:`apex_ompl.plan`: ``timeout``, ``seed``, ``simplify``, ``params``, ``snapshot``,
-                ``timing``, ``objective``, ``calm_factor``, ``leave_contact``.
+                ``timing``, ``objective``, ``calm_factor``, ``leave_contact``, ``constraints``.
 
         Raises:
             ApexError: The start, the goal, the planner, a parameter or the name of an option is faulty.
@@ -288,7 +292,9 @@ class MotionPlanner:
                     raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
             checker = self._checker_without({o.name for o in dynamic} if dynamic else self._absent())
             checker.check_counts = CheckCounts()
-            given = steps.assemble(problem, robot, seed=options.seed, group=options.group, checker=checker)
+            given = steps.assemble(
+                problem, robot, seed=options.seed, group=options.group, checker=checker, constraints=options.constraints
+            )
             departure, setup = departed(given, leave_contact, options.seed) if leave_contact else (None, given)
             notes += given.notes
             notes += [note for note in self._checker.mesh_notes if note not in given.notes]

@@ -28,6 +28,9 @@ from apex_ompl import planners
 from apex_ompl.apex.parameters import NAME
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
+from apex_ompl.constraints.constraint_set import ConstraintSet
+from apex_ompl.constraints.proof import ConstraintCertificate
+from apex_ompl.constraints.user import UserConstraint
 from apex_ompl.errors import ApexError, TimingError, TimingStoppedError
 from apex_ompl.ompl import setup as ompl_setup
 from apex_ompl.ompl.own_planner import SolveReport, reporting
@@ -46,6 +49,7 @@ from apex_ompl.result import FIRST, INSIDE, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
 from apex_ompl.robot.rest_to_rest import direct_durations
+from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import TimedPath, Timing, Trajectory, time_path
 from apex_ompl.timing.duration import CALM_FACTOR, DEFAULT_OBJECTIVE, check_objective
@@ -60,6 +64,7 @@ STRAIGHT_LINE = "straight line"
 UNNAMED = "unnamed"  # planner of a user's function before it is made
 NOT_PROVED = "a path was found but not proved in time"
 NOT_TIMED = "a path was found but not timed in time"
+CONSTRAINED_DEVIATION = 0.005  # largest deviation of a motion from a path under constraints [rad]
 REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
 
 
@@ -83,6 +88,7 @@ class PlanQuery:
         notes: What a user should know about this plan.
         interrupt: Holds Ctrl-C back.
         rejected_lines: Straight lines to goals that failed the full check, each of shape (2, dof).
+        nearest_state: State on the constraints near a start or a goal that violates them, shape (dof,), or None.
         first_path: First path that the planner found, or None.
         report: Report of the planner, of planners that make one.
     """
@@ -100,6 +106,7 @@ class PlanQuery:
     notes: list[str] = field(default_factory=list)
     interrupt: Interrupt = field(default_factory=Interrupt)
     rejected_lines: list[Array] = field(default_factory=list)
+    nearest_state: Array | None = None
     first_path: Path | None = None
     report: SolveReport | None = None
 
@@ -133,6 +140,7 @@ class FoundPath:
         path: The path, with the planner's spline where it has one, or None.
         solved_by: What found the path, see :class:`apex_ompl.PlanResult`.
         proof: Certificate of the path; the straight line has one before the planner runs.
+        constraints: Bounds on the violation of constraints along it, or None without constraints.
     """
 
     query: PlanQuery
@@ -141,6 +149,7 @@ class FoundPath:
     path: Path | None = None
     solved_by: str = ""
     proof: PathProof | None = None
+    constraints: ConstraintCertificate | None = None
 
     def __bool__(self) -> bool:
         """Whether there is a path from the start to a goal."""
@@ -159,8 +168,10 @@ class FoundPath:
             joint_names=robot.joint_names, planner=query.planner, seed=query.setup.seed, path=self.path,
             solved_by=self.solved_by, notes=tuple(query.notes),
             held_joints=tuple(robot.joint_names[k] for k in query.setup.held),
-            robot_digest=digest(robot),
+            robot_digest=digest(robot), nearest_state=query.nearest_state,
         )  # fmt: skip
+        if self.constraints is not None and query.setup.constraints is not None:
+            result = replace(result, **_constraint_fields(query.setup.constraints, self.constraints))
         return result if proof is None else replace(result, **certificate(proof))
 
 
@@ -170,6 +181,14 @@ def certificate(proof: PathProof) -> dict[str, Any]:
         "clearance": proof.clearance, "clearance_bound": proof.clearance_bound, "clearance_pair": proof.pair,
         "proved_by_spheres": proof.by_spheres,
     }  # fmt: skip
+
+
+def _constraint_fields(constraints: ConstraintSet, kept: ConstraintCertificate) -> dict[str, Any]:
+    """Return what a result says of the constraints along its path and its motion."""
+    return {
+        "constraint_violation": dict(zip(constraints.names, kept.violations.tolist(), strict=True)),
+        "constraint_bound": dict(zip(constraints.names, kept.bounds.tolist(), strict=True)),
+    }
 
 
 class ProvedPath(FoundPath):
@@ -182,7 +201,7 @@ Execute = Callable[[PlanQuery, ob.Planner, float], PlanStatus]
 
 def assemble(
     problem: Problem, robot: Robot | None = None, *, seed: int = 0, group: Group | None = None,
-    checker: CollisionChecker | None = None,
+    checker: CollisionChecker | None = None, constraints: Sequence[Constraint | UserConstraint] = (),
 ) -> PlanningSetup:  # fmt: skip
     """Make a problem ready: robot, collision checker, state space, start and goals, and OMPL's seed.
 
@@ -192,14 +211,16 @@ def assemble(
         seed: Seed of all random numbers of the plan, OMPL's among them.
         group: Joints that are planned, by names of groups and joints; the others stay as at the start. All by default.
         checker: Collision checker that has the bodies of the problem already.
+        constraints: Constraints along the path besides those of the problem.
 
     Raises:
-        ApexError: The robot, a mesh or a joint of the problem is unknown or faulty.
+        ApexError: The robot, a mesh or a joint of the problem, or the frame of a constraint is unknown or faulty, or
+            the constraints contradict each other.
     """
     robot = robot or load_robot(problem.robot)
     moving = None if group is None else planned_joints(robot, group)
     seed_ompl(seed)
-    return ompl_setup.assemble(problem, robot, seed=seed, checker=checker, moving=moving)
+    return ompl_setup.assemble(problem, robot, seed=seed, checker=checker, moving=moving, constraints=constraints)
 
 
 def check(
@@ -227,21 +248,38 @@ def check(
     check_objective(objective, calm_factor)
     started = clock.perf_counter() if started is None else started
     parameters = planners.chosen(planner, params, seed=setup.seed)
-    status, reason = query_fault(setup)
+    status, reason, nearest = query_fault(setup)
     name, spent = parameters.name or UNNAMED, dict(times or {})
     deadline = Deadline(timeout)
     return PlanQuery(
-        setup, name, parameters, deadline, objective, calm_factor, status, reason, started, spent, list(notes)
-    )
+        setup, name, parameters, deadline, objective, calm_factor, status, reason, started, spent, list(notes),
+        nearest_state=nearest,
+    )  # fmt: skip
 
 
-def query_fault(setup: PlanningSetup) -> tuple[PlanStatus | None, str]:
-    """Return the status and the reason of an invalid start, or of goals that are all invalid; else None."""
+def query_fault(setup: PlanningSetup) -> tuple[PlanStatus | None, str, Array | None]:
+    """Return status and reason of an invalid start, or of goals that are all invalid; else None.
+
+    Where constraints along the path are violated, the third is a state on them nearby, or None where none is found.
+    """
     if setup.start_fault:
-        return PlanStatus.INVALID_START, setup.start_fault + remedy(setup)
+        return PlanStatus.INVALID_START, setup.start_fault + remedy(setup), None
+    if setup.start_off:
+        return PlanStatus.START_OFF_CONSTRAINT, setup.start_off, _nearest(setup, setup.start)
     if all(setup.goal_faults):
-        return PlanStatus.INVALID_GOAL, "; ".join(setup.goal_faults)
-    return None, ""
+        return PlanStatus.INVALID_GOAL, "; ".join(setup.goal_faults), None
+    if not len(setup.valid_goals):
+        k = next(k for k, off in enumerate(setup.goals_off) if off)
+        reasons = (fault or off for fault, off in zip(setup.goal_faults, setup.goals_off, strict=True))
+        return PlanStatus.GOAL_OFF_CONSTRAINT, "; ".join(reasons), _nearest(setup, setup.goals[k])
+    return None, "", None
+
+
+def _nearest(setup: PlanningSetup, q: Array) -> Array | None:
+    """Return the state on the constraints that a state, shape (dof,), is moved to, or None where it does not arrive."""
+    assert setup.constraints is not None
+    found = setup.constraints.project(q[None])
+    return found.states[0] if found.ok[0] else None
 
 
 def execute(query: PlanQuery, planner: ob.Planner, timeout: float) -> PlanStatus:
@@ -296,9 +334,11 @@ def straight_line(query: PlanQuery) -> FoundPath | None:
             if setup.checker.collides_along(line):
                 query.rejected_lines.append(line)
                 continue
-            check = full_check(setup.checker, line, setup.start, setup.goals, deadline=query.deadline.at)
+            check = _full_check(query, line)
             if check:
-                return FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(line), STRAIGHT_LINE, check.proof)
+                return FoundPath(
+                    query, PlanStatus.EXACT_SOLUTION, "", Path(line), STRAIGHT_LINE, check.proof, check.constraints
+                )
             if check.timed_out:
                 return FoundPath(query, PlanStatus.TIMEOUT, NOT_PROVED)
             query.rejected_lines.append(line)
@@ -325,7 +365,9 @@ def prove(found: FoundPath, simplify: bool = True) -> ProvedPath:
     """
     query = found.query
     if found.path is None or found.proof is not None:
-        return ProvedPath(query, found.status, found.reason, found.path, found.solved_by, found.proof)
+        return ProvedPath(
+            query, found.status, found.reason, found.path, found.solved_by, found.proof, found.constraints
+        )
     try:
         with quiet_ompl():
             return _verified(found, found.path, simplify) if found else _checked(found, found.path)
@@ -445,19 +487,24 @@ def _verified(found: FoundPath, path: Path, simplify: bool) -> ProvedPath:
     """Return the first of the shortened path and the path itself that passes the full check, or can be repaired."""
     query, solved_by, setup, reason, late = found.query, found.solved_by, found.query.setup, "", False
     candidates = [with_exact_ends(setup, path)]
-    if simplify and not query.parameters.smooth and path.spline is None and not query.ends_search():
+    shortens = simplify and setup.constraints is None and not query.parameters.smooth
+    if shortens and path.spline is None and not query.ends_search():
         with timed(query.times, "simplify"):
             si = setup.simple_setup.getSpaceInformation()
             candidates.insert(0, Path(shorten(si, candidates[0].states, query.ends_search)))
         setup.raise_faults()
     for candidate in candidates:
         with timed(query.times, "verify"):
-            check = full_check(setup.checker, candidate.states, setup.start, setup.goals, deadline=query.deadline.at)
+            check = _full_check(query, candidate.states)
         if check:
-            return ProvedPath(query, PlanStatus.EXACT_SOLUTION, "", candidate, solved_by, check.proof)
+            return ProvedPath(
+                query, PlanStatus.EXACT_SOLUTION, "", candidate, solved_by, check.proof, check.constraints
+            )
         if check.timed_out:
             return ProvedPath(query, PlanStatus.TIMEOUT, NOT_PROVED)
         reason = reason or check.reason
+        if setup.constraints is not None:
+            continue
         with timed(query.times, "repair"):
             end = clock.perf_counter() + REPAIR_SHARE * query.deadline.remaining
             repaired = repair(setup, candidate.states, check, end, query.interrupt)
@@ -465,7 +512,16 @@ def _verified(found: FoundPath, path: Path, simplify: bool) -> ProvedPath:
             return ProvedPath(query, PlanStatus.EXACT_SOLUTION, "", repaired[0], f"{solved_by}+repair", repaired[1])
         late |= clock.perf_counter() >= end
     failed = "and was not repaired in time" if late else "and repair"
-    return ProvedPath(query, PlanStatus.TIMEOUT, f"the path found failed the full check {failed}, {reason}")
+    failed = "" if setup.constraints is not None else f" {failed}"
+    return ProvedPath(query, PlanStatus.TIMEOUT, f"the path found failed the full check{failed}, {reason}")
+
+
+def _full_check(query: PlanQuery, path: Array | Trajectory) -> FullCheck:
+    """Return the full check of a path or a motion from the start to a goal."""
+    setup = query.setup
+    return full_check(
+        setup.checker, path, setup.start, setup.goals, deadline=query.deadline.at, constraints=setup.constraints
+    )
 
 
 def _checked(found: FoundPath, path: Path) -> ProvedPath:
@@ -491,7 +547,7 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
             over = [f"{name} {share:.4f}" for name, share in motion.use(scaled).items() if share > 1.0 + ROUNDING]
             if over:
                 return FullCheck(False, f"the share of a limit that it uses is over 1: {', '.join(over)}", None)
-            return full_check(setup.checker, motion, setup.start, setup.goals, deadline=query.deadline.at)
+            return _full_check(query, motion)
 
     def fault(motion: Trajectory) -> str:
         found.append(check(motion))
@@ -499,6 +555,8 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
 
     made: TimedPath | None = None
     by_objective = query.objective != "length" and timing.start(scaled) is None and knows_obstacles(setup)
+    if setup.constraints is not None:
+        by_objective, timing = False, replace(timing, deviation=min(timing.deviation, CONSTRAINED_DEVIATION))
     try:
         with timed(query.times, "timing"):
             if more is not None and (overload := more.gravity_fault(path.states)):
@@ -520,6 +578,9 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         made, motion_proof = better.timed, better.motion_proof
         result = replace(result, path=better.path, **certificate(better.path_proof))
     assert made is not None
+    kept = found[-1].constraints if found else None
+    if kept is not None and setup.constraints is not None:
+        result = replace(result, **_constraint_fields(setup.constraints, kept))
     use = made.trajectory.use(limits) | ({} if more is None else more.use(made.trajectory))
     return replace(
         result, trajectory=made.trajectory, limit_use=use, deviation=made.deviation,

@@ -3,9 +3,9 @@
 The messages are ``moveit_msgs/PlanningScene`` (or its ``world`` alone) and ``moveit_msgs/MotionPlanRequest``, in either
 of two spellings: poses as lists or as x/y/z(/w) mappings, primitive types by name or by number. The pose of a primitive
 is composed with that of its object and of the object's frame; every primitive of an object becomes an obstacle. Allowed
-collision matrices (``moveit_msgs/AllowedCollisionMatrix``) become pairs of bodies that may touch. Content that would
-change the problem and is not supported is an error that names it. Content that is left out without effect is listed in
-the notes.
+collision matrices (``moveit_msgs/AllowedCollisionMatrix``) become pairs of bodies that may touch, ``path_constraints``
+(``moveit_msgs/Constraints``) constraints along the path. Content that would change the problem and is not supported is
+an error that names it. Content that is left out without effect is listed in the notes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,16 +23,22 @@ from apex_ompl.errors import FileFormatError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.config import resolve
 from apex_ompl.robot.model import link_of
-from apex_ompl.scene.bodies import AttachedObject, BodyT, Obstacle, pose_fields, pose_matrix
+from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields, pose_matrix
+from apex_ompl.scene.constraints import Constraint, FixedOrientation, ToolRegion, Upright
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.types import Array
-from apex_ompl.util.schema import read_yaml, validate
+from apex_ompl.util.schema import StrictModel, read_yaml, validate
 from apex_ompl.util.validation import is_integer, is_number
 
 MATRIX = "allowed_collision_matrix"
 PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
 ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
 WORLD_FRAMES = ("", "world", "map")
+SIDES = ("above", "below")  # of a joint's tolerances
+TURN = 3.14  # tolerance of an angle from which turns about an axis are free [rad]
+EXACT_ANGLE = 0.01  # tolerance up to which an orientation counts as fixed [rad]
+SAME_POINT = 1e-4  # largest distance between points that count as the same [m]
+RecordT = TypeVar("RecordT", bound=StrictModel)
 HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allowed_planning_time", "pipeline_id")
 
 
@@ -286,12 +292,35 @@ class _Reader(MessageReader):
             return {"sphere": {"radius": values[0]}}
         return {"cylinder": {"radius": values[1], "length": values[0]}}
 
-    def body(self, kind: type[BodyT], fields: dict[str, Any], where: str) -> BodyT:
-        """Return an obstacle or a held object."""
+    def constrained_link(self, message: Mapping[str, Any], start: Array, where: str) -> tuple[str, Array]:
+        """Return the link of a constraint, and the pose of the frame that it is given in, shape (4, 4)."""
+        given = str(message.get("link_name"))
+        link = self.frame_map.get(given, given).lstrip("/")
+        if link not in self.robot.link_names:
+            expected = f"expected a link of {self.robot.name}; map it with --frame {given}=LINK"
+            raise self.fail(f"{where}.link_name", given, expected)
+        name = str(self.section(message, "header", where).get("frame_id", ""))
+        base = self.frame_map.get(name, name).lstrip("/")
+        if base in self.robot.link_names:
+            model = self.robot.model
+            if model.frames[self.robot.link_frame(base)].parentJoint != 0:
+                raise self.fail(f"{where}.header.frame_id", name, "cannot be read, expected a frame that does not move")
+        return link, self.frame(name, start, where)
+
+    def refuse(self, data: Mapping[str, Any], key: str, value: object, expected: str, where: str = "") -> None:
+        """Raise a FileFormatError where a part of a message is there and not empty."""
+        found = data.get(key)
+        if any(found.values()) if isinstance(found, Mapping) else found:
+            raise self.fail(inside(where, key), value, expected)
+
+    def record(self, kind: type[RecordT], fields: dict[str, Any], where: str) -> RecordT:
+        """Return an obstacle, a held object or a constraint."""
         try:
             return validate(kind, fields, str(self.file))
         except FileFormatError as error:
-            raise self.fail(inside(where, error.field), error.value, error.expected) from error
+            raise self.fail(
+                inside(where, error.field) if error.field else where, error.value, error.expected
+            ) from error
 
     def operation(self, item: Mapping[str, Any], known: tuple[int, ...], where: str) -> int:
         """Return what is done with an object, out of the known operations."""
@@ -356,6 +385,7 @@ def convert(
     for key, usual in (("link_padding", 0.0), ("link_scale", 1.0)):
         if any(item.get(key.removeprefix("link_"), usual) != usual for item in at_scene.messages(scene_data, key)):
             notes.append(f"{key}: not used, the robot has its own size")
+    constraints = tuple(_path_constraints(at_request, request_data, q))
     goals = _goals(at_request, request_data, start)
     for key in HARMLESS:
         if request_data.get(key):
@@ -364,7 +394,7 @@ def convert(
     fields = {
         "name": name, "robot": robot.name, "scene": tuple(obstacles), "attached": tuple(attached),
         "allowed": tuple(allowed), "start": start,
-        "goal": Goal(joints=tuple(goals)),
+        "goal": Goal(joints=tuple(goals)), "constraints": constraints,
     }  # fmt: skip
     problem = validate(Problem, fields, str(scene))
     return Conversion(problem, notes)
@@ -386,7 +416,7 @@ def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[O
             continue
         base = reader.frame(str(reader.section(item, "header", where).get("frame_id", "")), start, where)
         found[label or where] = [  # in place of what was added by that name before
-            reader.body(Obstacle, {"name": name, **shape, **pose_fields(base @ pose)}, where)
+            reader.record(Obstacle, {"name": name, **shape, **pose_fields(base @ pose)}, where)
             for name, shape, pose in _bodies(reader, item, where)
         ]
     return [body for bodies in found.values() for body in bodies]
@@ -411,7 +441,7 @@ def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Arra
             fields = {"name": label, "link": link, **shape, **pose_fields(base @ pose)}
             if known:
                 fields["touch_links"] = tuple({*known, *reader.robot.hand_of(link)})
-            yield reader.body(AttachedObject, fields, here)
+            yield reader.record(AttachedObject, fields, here)
 
 
 def _bodies(reader: _Reader, item: Mapping[str, Any], where: str) -> list[tuple[str, dict[str, Any], Array]]:
@@ -426,10 +456,98 @@ def _bodies(reader: _Reader, item: Mapping[str, Any], where: str) -> list[tuple[
     return [(name, shape, own @ pose) for name, (shape, pose) in zip(names, shapes, strict=True)]
 
 
+def _path_constraints(reader: _Reader, data: Mapping[str, Any], start: Array) -> Iterator[Constraint]:
+    """Yield the constraints of ``path_constraints``, which imply those of the message."""
+    reader.refuse(data, "trajectory_constraints", "constraints of a trajectory", "cannot be read, expected none")
+    where = "path_constraints"
+    message = reader.section(data, where)
+    reader.refuse(message, "visibility_constraints", "a list", "cannot be read, expected none", where)
+    for k, joint in enumerate(reader.messages(message, "joint_constraints", where)):
+        _check_joint_constraint(reader, joint, f"{where}.joint_constraints.{k}")
+    for k, orientation in enumerate(reader.messages(message, "orientation_constraints", where)):
+        yield from _orientation_constraint(reader, orientation, start, f"{where}.orientation_constraints.{k}")
+    for k, position in enumerate(reader.messages(message, "position_constraints", where)):
+        yield _position_constraint(reader, position, start, f"{where}.position_constraints.{k}")
+
+
+def _check_joint_constraint(reader: _Reader, message: Mapping[str, Any], where: str) -> None:
+    """Raise a FileFormatError unless a joint's limits imply its constraint."""
+    joint = reader.joint(str(message.get("joint_name")), where)
+    if joint is None:
+        return
+    position = reader.number(message.get("position"), f"{where}.position")
+    above, below = (reader.number(message.get(f"tolerance_{side}", 0.0), f"{where}.tolerance_{side}") for side in SIDES)
+    k = reader.robot.joint_names.index(joint)
+    lower, upper = float(reader.robot.limits.lower[k]), float(reader.robot.limits.upper[k])
+    if position - below > lower or position + above < upper:
+        found = [position - below, position + above]
+        raise reader.fail(
+            where, found, f"cannot be read, expected a range that holds the limits [{lower:g}, {upper:g}]"
+        )
+    reader.notes.append(f"{where}: not used, the limits of {joint} are inside")
+
+
+def _orientation_constraint(
+    reader: _Reader, message: Mapping[str, Any], start: Array, where: str
+) -> Iterator[Constraint]:
+    """Yield a constraint of the orientation, or of one axis where turns about it are free.
+
+    MoveIt bounds the angles about x, y and z of the rotation from the wanted orientation, as Euler angles or as parts
+    of the rotation vector. Up to a right angle none of them is larger than the angle of the rotation, which is bounded
+    here.
+    """
+    link, base = reader.constrained_link(message, start, where)
+    base = base @ reader.pose({"orientation": message.get("orientation")}, where)
+    keys = [f"absolute_{axis}_axis_tolerance" for axis in "xyz"]
+    tolerances = [reader.number(message.get(key, 0.0), f"{where}.{key}") for key in keys]
+    if min(tolerances) <= 0.0:
+        raise reader.fail(where, tolerances, "expected three tolerances of angles above 0")
+    free = [k for k in range(3) if tolerances[k] >= TURN]
+    kept = [value for value in tolerances if value < TURN]
+    if not kept:
+        reader.notes.append(f"{where}: not used, any orientation is within its tolerances")
+        return
+    if len(free) == 2:
+        raise reader.fail(where, tolerances, "cannot be read, expected at most one tolerance from pi, or three")
+    if min(kept) != max(kept):
+        reader.notes.append(f"{where}: its tolerances differ, and the smallest holds for all")
+    angle, orientation = min(*kept, np.pi / 2), {"orientation": pose_fields(base)["orientation"]}
+    if free:
+        axis, up = np.eye(3)[free[0]], base[:3, free[0]]
+        fields = {"frame": link, "axis": tuple(axis.tolist()), "up": tuple(up.tolist()), "angle": angle}
+        yield reader.record(Upright, fields, where)
+    elif angle <= EXACT_ANGLE:
+        yield reader.record(FixedOrientation, {"frame": link, "angle": angle, **orientation}, where)
+    else:
+        yield reader.record(ToolRegion, {"frame": link, "angle": angle, **orientation}, where)
+
+
+def _position_constraint(reader: _Reader, message: Mapping[str, Any], start: Array, where: str) -> ToolRegion:
+    """Return the box that a link's origin, or the grasp point of a hand, stays in."""
+    link, base = reader.constrained_link(message, start, where)
+    offset = reader.numbers(message.get("target_point_offset"), "xyz", (0.0, 0.0, 0.0), f"{where}.target_point_offset")
+    if float(np.linalg.norm(offset)) > SAME_POINT:
+        hands = {name: hand.point for name, hand in reader.robot.hands.items() if hand.palm == link}
+        near = [name for name, point in hands.items() if float(np.linalg.norm(offset - point)) <= SAME_POINT]
+        if not near:
+            expected = "cannot be read, expected 0, or the grasp point of a hand"
+            raise reader.fail(f"{where}.target_point_offset", offset.tolist(), expected)
+        link = near[0]
+    inside_of = f"{where}.constraint_region"
+    region = reader.section(message, "constraint_region", where)
+    reader.refuse(region, "meshes", "a list", "cannot be read, expected one box", inside_of)
+    shapes = reader.paired(region, "primitives", "primitive_poses", inside_of)
+    if len(shapes) != 1:
+        raise reader.fail(f"{inside_of}.primitives", len(shapes), "cannot be read, expected one box")
+    shape = reader.primitive(shapes[0][0], f"{inside_of}.primitives.0")
+    if "box" not in shape:
+        raise reader.fail(f"{inside_of}.primitives.0", next(iter(shape)), "cannot be read, expected one box")
+    half = np.array(shape["box"]) / 2.0
+    fields = {"lower": tuple((-half).tolist()), "upper": tuple(half.tolist()), **pose_fields(base @ shapes[0][1])}
+    return reader.record(ToolRegion, {"frame": link, **fields}, inside_of)
+
+
 def _goals(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float]) -> list[dict[str, float]]:
-    for key in ("path_constraints", "trajectory_constraints"):
-        if any((data.get(key) or {}).values()) if isinstance(data.get(key), Mapping) else data.get(key):
-            raise reader.fail(key, "constraints along the path", "cannot be read, expected none")
     goals = []
     for k, goal in enumerate(reader.messages(data, "goal_constraints")):
         where = f"goal_constraints.{k}"

@@ -253,8 +253,8 @@ class AttachedObject(MassiveBody):
 
     Attributes:
         link: The link that holds it, by default the first of ``links``.
-        links: Two links that hold it together: it is attached to the first, and the second keeps its pose relative to it
-            along the whole path.
+        links: Two links that hold it together: it is attached to the first, and the second one keeps its pose relative
+            to that along the whole path.
         touch_links: Links that it may touch; None means all links of the hands that hold it.
         contact: Its contact face.
     """

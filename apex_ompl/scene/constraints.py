@@ -70,7 +70,7 @@ class Constraint(StrictModel):
     @model_serializer(mode="wrap")
     def _kind_first(self, others: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Return the fields with the kind, which is not left out as a default."""
-        return {"kind": self.kind} | others(self)
+        return {"kind": self.kind, **others(self)}
 
 
 class Upright(Constraint):

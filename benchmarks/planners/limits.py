@@ -29,7 +29,7 @@ from apex_ompl.kernel.compiled.path.path_optimization import _factorize
 from apex_ompl.kernel.compiled.robot.kinematics import place_cluster, place_robot
 from apex_ompl.kernel.compiled.workspace import workspace_view
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.paths.optimizer import Optimizer, _grid
+from apex_ompl.paths.optimizer import Optimizer, path_grid
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
@@ -136,7 +136,7 @@ def stages(repeat: int) -> list[tuple[str, float, float, str, float]]:
     many, threads = np.tile(states, (8, 1)), os.cpu_count() or 1
     took = least(lambda: kernel.unproved(many, threads), repeat, len(many))
     rows.append((f"the same of many, by {threads} threads", np.nan, 0.0, "double", took))
-    grid, dof = _grid(optimizer.spline, optimizer.settings.samples), len(limits.lower)
+    grid, dof = path_grid(optimizer.spline, optimizer.settings.samples), len(limits.lower)
     n, band = optimizer.spline.free * dof, grid[0].shape[1] * dof
     matrix = np.eye(dof) + 1.0
     gram, room = np.zeros((n, n)), np.zeros((2, n))

@@ -13,6 +13,7 @@ from apex_ompl.errors import ApexError, FileFormatError
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.config import DATA
 from apex_ompl.robot.moveit import Conversion, convert
+from apex_ompl.scene.constraints import FixedOrientation, ToolRegion, Upright
 
 JOINTS = {f"panda_joint{k}": f"left_joint{k}" for k in range(1, 8)}
 FRAMES = {"base_link": "world", "palm": "left_hand_palm"}
@@ -122,7 +123,6 @@ def test_goals_of_the_wrong_form_are_errors(robot: Robot, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("addition", "word"),
     [
-        ("path_constraints: {joint_constraints: [{joint_name: x}]}", "path_constraints"),
         ("trajectory_constraints: {constraints: [{name: x}]}", "trajectory_constraints"),
     ],
 )
@@ -186,3 +186,132 @@ def test_what_ros_prints_may_end_in_an_empty_document(robot: Robot, tmp_path: Pa
 def test_texts_are_no_numbers(robot: Robot, tmp_path: Path, value: str) -> None:
     with pytest.raises(FileFormatError, match=r"pose\.position: expected 3 finite numbers"):
         converted(tmp_path, robot, SCENE.replace("position: [0.5, 0.0, 0.1]", f"position: {value}"))
+
+
+def along(folder: Path, robot: Robot, message: str) -> Conversion:
+    return converted(folder, robot, request=REQUEST + "path_constraints:\n" + message)
+
+
+def orientation(tolerances: str, more: str = "", turn: str = "[0, 0, 0.7071068, 0.7071068]") -> str:
+    x, y, z = tolerances.split()
+    return (
+        f"  orientation_constraints:\n  - {{header: {{frame_id: base_link}}, link_name: palm, orientation: {turn}, "
+        f"absolute_x_axis_tolerance: {x}, absolute_y_axis_tolerance: {y}, absolute_z_axis_tolerance: {z}{more}}}\n"
+    )
+
+
+def test_orientation_constraints_become_constraints_of_the_frame(robot: Robot, tmp_path: Path) -> None:
+    turned = Rotation.from_euler("z", 90, degrees=True)
+    (region,) = along(tmp_path, robot, orientation("0.2 0.2 0.2")).problem.constraints
+    assert isinstance(region, ToolRegion) and region.frame == "left_hand_palm" and region.angle == 0.2
+    assert region.lower == region.upper == (None, None, None)
+    np.testing.assert_allclose(Rotation.from_quat(region.orientation).as_matrix(), turned.as_matrix(), atol=1e-6)
+    (fixed,) = along(tmp_path, robot, orientation("0.01 0.01 0.01")).problem.constraints
+    assert isinstance(fixed, FixedOrientation) and fixed.angle == 0.01
+    np.testing.assert_allclose(Rotation.from_quat(fixed.orientation).as_matrix(), turned.as_matrix(), atol=1e-6)
+    for k, tolerances in enumerate(("3.1416 0.1 0.1", "0.1 3.15 0.1", "0.1 0.1 6.3")):
+        (upright,) = along(tmp_path, robot, orientation(tolerances)).problem.constraints
+        assert isinstance(upright, Upright) and upright.angle == 0.1
+        np.testing.assert_array_equal(upright.axis, np.eye(3)[k])
+        np.testing.assert_allclose(upright.up, turned.as_matrix()[:, k], atol=1e-6)
+
+
+def test_the_smallest_of_different_tolerances_holds_for_all(robot: Robot, tmp_path: Path) -> None:
+    done = along(tmp_path, robot, orientation("0.1 0.3 0.2"))
+    assert done.problem.constraints[0].angle == 0.1
+    assert any("orientation_constraints.0: its tolerances differ" in note for note in done.notes)
+    done = along(tmp_path, robot, orientation("4 4 4"))
+    assert not done.problem.constraints
+    assert any("not used, any orientation is within its tolerances" in note for note in done.notes)
+
+
+@pytest.mark.parametrize("angle", [0.1, 0.7, 1.5])
+def test_rotations_by_an_angle_are_within_moveits_tolerances(angle: float) -> None:
+    """What the import relies on, for Euler angles and for rotation vectors."""
+    axes = np.random.default_rng(0).normal(size=(500, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    turns = Rotation.from_rotvec(angle * axes)
+    assert np.abs(turns.as_euler("XYZ")).max() <= angle + 1e-12
+    assert np.abs(turns.as_rotvec()).max() <= angle + 1e-12
+    for k, axis in ((2, (0.0, 0.0, 1.0)), (0, (1.0, 0.0, 0.0))):  # an axis tilts by the angle, turned about itself
+        across = axes * (np.arange(3) != k)
+        tilts = Rotation.from_rotvec(angle * across / np.linalg.norm(across, axis=1)[:, None])
+        spun = tilts * Rotation.from_rotvec(np.linspace(-3.0, 3.0, 500)[:, None] * np.array(axis))
+        others = [j for j in range(3) if j != k]
+        assert np.abs(spun.as_euler("XYZ"))[:, others].max() <= angle + 1e-12
+
+
+BOX = """  position_constraints:
+  - header: {frame_id: world}
+    link_name: palm
+    constraint_region:
+      primitives: [{type: 1, dimensions: [0.2, 0.4, 0.6]}]
+      primitive_poses: [{position: [0.5, 0.1, 0.3], orientation: [0, 0, 0.7071068, 0.7071068]}]
+"""
+
+
+def test_a_box_for_a_position_becomes_a_region(robot: Robot, tmp_path: Path) -> None:
+    (region,) = along(tmp_path, robot, BOX).problem.constraints
+    assert isinstance(region, ToolRegion) and region.frame == "left_hand_palm" and region.angle is None
+    np.testing.assert_allclose(region.upper, [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(region.lower, [-0.1, -0.2, -0.3])
+    np.testing.assert_allclose(region.position, [0.5, 0.1, 0.3])
+    np.testing.assert_allclose(region.orientation, [0, 0, 0.7071068, 0.7071068], atol=1e-7)
+    point = list(robot.hands["left_hand"].point)
+    (region,) = along(tmp_path, robot, BOX + f"    target_point_offset: {point}\n").problem.constraints
+    assert region.frame == "left_hand"
+
+
+def test_joint_constraints_are_dropped_where_the_limits_are_inside(robot: Robot, tmp_path: Path) -> None:
+    text = "  joint_constraints: [{joint_name: panda_joint1, position: 0, tolerance_above: 3, tolerance_below: 3}]\n"
+    done = along(tmp_path, robot, text)
+    assert not done.problem.constraints
+    assert "path_constraints.joint_constraints.0: not used, the limits of left_joint1 are inside" in done.notes
+    done = along(tmp_path, robot, "  joint_constraints: [{joint_name: finger, position: 0}]\n")
+    assert any("joint 'finger' is not planned" in note for note in done.notes)
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (orientation("0.1 4 4"), "orientation_constraints.0: cannot be read, expected at most one tolerance from pi"),
+        (orientation("0.1 0.1 0"), "orientation_constraints.0: expected three tolerances of angles above 0"),
+        (orientation("0.1 0.1 .nan"), "absolute_z_axis_tolerance: expected a finite number, got nan"),
+        (
+            orientation("0.1 0.1 0.1", turn="[1, 0]"),
+            "orientation_constraints.0.orientation: expected 4 finite numbers",
+        ),
+        (orientation("0.1 0.1 0.1").replace("palm", "claw"), "link_name: expected a link of .*--frame claw=LINK"),
+        (orientation("0.1 0.1 0.1").replace("base_link", "left_link4"), "expected a frame that does not move"),
+        (orientation("0.1 0.1 0.1").replace("base_link", "moon"), "'moon'"),
+        (
+            BOX.replace("type: 1, dimensions: [0.2, 0.4, 0.6]", "type: 2, dimensions: [0.2]"),
+            "expected one box, got 'sphere'",
+        ),
+        (
+            BOX.replace("primitives: [", "primitives: [{type: 1, dimensions: [1, 1, 1]}, "),
+            "primitive_poses: .*2 poses",
+        ),
+        (BOX.replace("primitive", "other"), "constraint_region.primitives: cannot be read, expected one box, got 0"),
+        (BOX + "      meshes: [{resource: a.obj}]\n", "constraint_region.meshes: cannot be read, expected one box"),
+        (BOX.replace("0.2, 0.4, 0.6", "0.2, 0.4, 0.0001"), "constraint_region: expected bounds of z .* apart"),
+        (
+            BOX + "    target_point_offset: [0, 0, 0.3]\n",
+            "target_point_offset: cannot be read, expected 0, or the grasp",
+        ),
+        (
+            "  joint_constraints: [{joint_name: panda_joint1, position: 0}]\n",
+            "joint_constraints.0: .*range that holds the limits",
+        ),
+        (
+            "  visibility_constraints: [{target_radius: 0.1}]\n",
+            "path_constraints.visibility_constraints: cannot be read",
+        ),
+        ("  position_constraints: {a: 1}\n", "path_constraints.position_constraints: expected a list"),
+    ],
+)  # fmt: skip
+def test_path_constraints_that_cannot_be_read_are_errors(
+    robot: Robot, tmp_path: Path, message: str, words: str
+) -> None:
+    with pytest.raises(FileFormatError, match=words):
+        along(tmp_path, robot, message)

@@ -4,6 +4,11 @@ A stage is a small record of its parameters with one method, ``run(context)``. T
 chosen by ``apex_ompl.apex.parameters.ApexParameters.stages``.
 """
 
+from apex_ompl.apex.stages.constrained import ConstrainedLines as ConstrainedLines
+from apex_ompl.apex.stages.constrained import ConstrainedProposals as ConstrainedProposals
+from apex_ompl.apex.stages.constrained import ConstrainedShorten as ConstrainedShorten
+from apex_ompl.apex.stages.constrained import ConstrainedTrees as ConstrainedTrees
+from apex_ompl.apex.stages.constrained import ConstrainedTurns as ConstrainedTurns
 from apex_ompl.apex.stages.known import CheckKnown as CheckKnown
 from apex_ompl.apex.stages.known import KnownCandidates as KnownCandidates
 from apex_ompl.apex.stages.proposals import Farthest as Farthest

@@ -231,6 +231,10 @@ CONSTRAINED = Group(
                 ROBOT + WORKSPACE + ROBOT + "f8[::1], f8, i8[::1], f8[::1], i8",
                 2,
             ),
+            "constraint.proof.prove_constraints": (
+                ROBOT + WORKSPACE + ROBOT + f"{KNOTS}, i8[::1], f8[::1], i8, i8[::1], f8[::1]",
+                3,
+            ),
             "constraint.search.grow_constrained_trees": (
                 ROBOT + SCENE + WORKSPACE + TREES + PROOF + ", " + ROBOT + "i8, i8, i8[::1], f8[::1], f8[:, ::1]",
                 8,

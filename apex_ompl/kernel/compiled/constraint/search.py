@@ -71,44 +71,52 @@ def _is_edge_free(
     return True
 
 
-class Trees(NamedTuple):
-    """Two trees and what they grow by.
+class Edges(NamedTuple):
+    """Edges towards a state.
 
     Attributes:
-        states: Nodes as columns, shape (2, dof, M).
-        parents: Their parents, -1 for roots, shape (2, M).
-        sizes: Numbers of nodes, shape (2,) or more.
         longest: Length of an edge before its projection [rad].
-        pieces: Number of chords of an edge.
-        target: State that a tree goes for, shape (dof,).
-        squares: Memory, shape (M,).
-        begin: Memory, shape (dof,).
-        end: Memory, shape (dof,).
+        pieces: Number of its chords.
+        target: The state, shape (dof,).
+        begin: Start of an edge, shape (dof,).
+        end: Its end, shape (dof,).
         motion: Memory, shape (2, dof).
     """
 
-    states: Floats
-    parents: Integers
-    sizes: Integers
     longest: float
     pieces: int
     target: Floats
-    squares: Floats
     begin: Floats
     end: Floats
     motion: Floats
 
 
+class Trees(NamedTuple):
+    """Two trees.
+
+    Attributes:
+        states: Nodes as columns, shape (2, dof, M).
+        parents: Their parents, -1 for roots, shape (2, M).
+        sizes: Numbers of nodes, shape (2,) or more.
+        squares: Memory, shape (M,).
+    """
+
+    states: Floats
+    parents: Integers
+    sizes: Integers
+    squares: Floats
+
+
 @inlined
 def _step(
-    t: RobotArrays, s: SceneArrays, w: Workspace, c: ConstraintArrays, trees: Trees, exact: bool, b: RowBuffers,
+    t: RobotArrays, s: SceneArrays, w: Workspace, c: ConstraintArrays, e: Edges, exact: bool, b: RowBuffers,
     p: ProofBuffers,
 ) -> bool:  # fmt: skip
-    """Put the end of an edge from ``trees.begin`` towards the target into ``trees.end``; whether it may be added.
+    """Put the end of an edge from ``e.begin`` towards the target into ``e.end``; whether it may be added.
 
     The target is reached itself where it is ``exact``, on the constraints.
     """
-    begin, end, target, longest = trees.begin, trees.end, trees.target, trees.longest
+    begin, end, target, longest = e.begin, e.end, e.target, e.longest
     apart = _distance(begin, target)
     if apart <= SAME:
         return False
@@ -122,27 +130,27 @@ def _step(
         moved = _distance(begin, end)
         if moved > MOST_MOVE * longest or moved < LEAST_MOVE * longest or _distance(end, target) >= apart:
             return False
-    return _is_edge_free(t, s, w, c, begin, end, trees.pieces, trees.motion, b, p)
+    return _is_edge_free(t, s, w, c, begin, end, e.pieces, e.motion, b, p)
 
 
 @inlined
 def _extend(
-    t: RobotArrays, s: SceneArrays, w: Workspace, c: ConstraintArrays, trees: Trees, tree: int, exact: bool,
-    b: RowBuffers, p: ProofBuffers,
+    t: RobotArrays, s: SceneArrays, w: Workspace, c: ConstraintArrays, trees: Trees, tree: int, e: Edges,
+    exact: bool, b: RowBuffers, p: ProofBuffers,
 ) -> tuple[int, int]:  # fmt: skip
     """Let a tree go for the target from its nearest node; return that and its last node, -1 where there is no room."""
-    root = nearest(trees.states[tree], trees.sizes[tree], trees.target, trees.squares)
-    near, dof = root, len(trees.target)
+    root = nearest(trees.states[tree], trees.sizes[tree], e.target, trees.squares)
+    near, dof = root, len(e.target)
     for i in range(dof):
-        trees.begin[i] = trees.states[tree, i, near]
+        e.begin[i] = trees.states[tree, i, near]
     while True:
         node = trees.sizes[tree]
         if node == trees.states.shape[2]:
             return root, -1
-        if not _step(t, s, w, c, trees, exact, b, p):
+        if not _step(t, s, w, c, e, exact, b, p):
             return root, near
         for i in range(dof):
-            trees.states[tree, i, node] = trees.begin[i] = trees.end[i]
+            trees.states[tree, i, node] = e.begin[i] = e.end[i]
         trees.parents[tree, node] = near
         trees.sizes[tree], near = node + 1, node
 
@@ -197,24 +205,81 @@ def grow_constrained_trees(
     dof = states.shape[1]
     b = rows_view(bi, bf, (rows, dof))
     p = ProofBuffers(resolution, starts, queue, ends, state, found, counts)
-    trees = Trees(states, parents, sizes, longest, pieces, target, squares, room[0], room[1], motion)
+    trees, e = Trees(states, parents, sizes, squares), Edges(longest, pieces, target, room[0], room[1], motion)
     met[0] = met[1] = -1
     for k in range(len(samples)):
         first = sizes[2] if sizes[0] == sizes[1] else int(sizes[1] < sizes[0])
         sizes[2] = 1 - first
         for i in range(dof):
             target[i] = samples[k, i]
-        root, new = _extend(t, s, w, c, trees, first, False, b, p)
+        root, new = _extend(t, s, w, c, trees, first, e, False, b, p)
         if new < 0:
             return k
         if new == root:
             continue
         for i in range(dof):  # the other one goes for it
             target[i] = states[first, i, new]
-        root, node = _extend(t, s, w, c, trees, 1 - first, True, b, p)
+        root, node = _extend(t, s, w, c, trees, 1 - first, e, True, b, p)
         if node < 0:
             return k
-        if _distance(trees.begin, target) <= SAME:
+        if _distance(e.begin, target) <= SAME:
             met[first], met[1 - first] = new, node
             return k + 1
     return len(samples)
+
+
+@entry_point
+def connect_states(
+    ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, wi: Integers, wf: Floats,
+    first: Floats, longest: float, resolution: float, target: Floats, nodes: Floats,
+    motion: Floats, starts: Integers, queue: Integers, ends: Integers, state: Floats, found: Integers, counts: Integers,
+    ci: Integers, cf: Floats, pieces: int, rows: int, bi: Integers, bf: Floats, room: Floats,
+) -> int:  # fmt: skip
+    """Go from a state of the manifold towards another one in edges as trees do.
+
+    Args:
+        ri: Robot, packed.
+        rf: Robot.
+        si: Scene, packed.
+        sf: Scene.
+        sg: Scene.
+        wi: Workspace.
+        wf: Workspace.
+        first: The first state, shape (dof,).
+        longest: Length of an edge before its projection [rad].
+        resolution: Largest spacing of the states that are checked [rad, max-norm].
+        target: The last state, shape (dof,).
+        nodes: Gets the states after the first one, shape (M, dof).
+        motion: Memory; this and what follows as of :func:`grow_constrained_trees`.
+        starts: Memory.
+        queue: Memory.
+        ends: Memory.
+        state: Memory.
+        found: Memory.
+        counts: Gets numbers of what was proved.
+        ci: Groups of rows, packed.
+        cf: Groups of rows.
+        pieces: Number of chords of an edge.
+        rows: Number of all rows.
+        bi: Buffers.
+        bf: Buffers.
+        room: Memory.
+
+    Returns:
+        How many states there are up to the target, or -1 where it was not reached.
+    """
+    t, s, c = robot_view(ri, rf), scene_view(si, sf, sg), constraints_view(ci, cf)
+    w = workspace_view(t, wi, wf)
+    b = rows_view(bi, bf, (rows, len(first)))
+    p = ProofBuffers(resolution, starts, queue, ends, state, found, counts)
+    e = Edges(longest, pieces, target, room[0], room[1], motion)
+    for i in range(len(first)):
+        e.begin[i] = first[i]
+    for n in range(len(nodes)):
+        if not _step(t, s, w, c, e, True, b, p):
+            return -1
+        for i in range(len(first)):
+            nodes[n, i] = e.begin[i] = e.end[i]
+        if _distance(e.begin, target) <= SAME:
+            return n + 1
+    return -1
