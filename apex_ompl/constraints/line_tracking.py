@@ -110,6 +110,7 @@ class LineTracker:
         if self._complete(best) and not self._cost(best):
             return best
         for _ in range(ROUNDS):
+            before = len(best.u)
             for improved in (self.relaxed, self.chosen):
                 if self.stop() or len(track.u) < 2:
                     return best
@@ -119,7 +120,7 @@ class LineTracker:
                 if self._complete(best):
                     return best
             count, track = len(track.u), self.tracked(track)
-            if len(track.u) == count:
+            if len(track.u) == count or len(best.u) == before:
                 break
         return best
 
@@ -192,14 +193,16 @@ class LineTracker:
     def refined(self, track: Track) -> Track:
         """Return a track with more states, so that straight lines in between keep the poses; or as far as they do."""
         u, q = track
-        for _ in range(REFINEMENTS):
+        for count in range(REFINEMENTS + 1):
             middle_u = 0.5 * (u[:-1] + u[1:])
             middle = 0.5 * (q[:-1] + q[1:])
             error = pose_errors(*self.tools.poses(middle), *self.path.poses(middle_u))
             size = np.maximum(np.abs(error[..., :3]), TURN * np.abs(error[..., 3:])).max(axis=(1, 2))
             split = np.flatnonzero(size > CHORD)
-            if not len(split) or self.stop():
-                return Track(u, q)
+            if not len(split):
+                break
+            if count == REFINEMENTS:
+                return Track(u, q).upto(int(split[0]) + 1)
             found, ok = self._closed(self._guesses(u, q)[split], middle_u[split])
             apart = np.abs(q[split + 1] - q[split]).max(axis=1)
             ok &= np.abs(found - middle[split]).max(axis=1) <= 0.5 * apart + 1e-3

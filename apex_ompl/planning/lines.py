@@ -123,7 +123,8 @@ class LineQuery(NamedTuple):
     Attributes:
         problem: The problem, whose goal are the last poses.
         start: The start, inside the limits, shape (dof,).
-        tools: The frames.
+        tools: The frames, and those of second hands that hold an object with them.
+        names: Names of the frames that were given.
         poses: Their poses, that at the start first, shape (K, F, 4, 4).
         blend: Radius of blends [m].
         speed: Largest speed of each frame, or None [m/s].
@@ -133,6 +134,7 @@ class LineQuery(NamedTuple):
     problem: Problem
     start: Array
     tools: tuple[Tool, ...]
+    names: tuple[str, ...]
     poses: Array
     blend: float
     speed: float | None
@@ -173,18 +175,19 @@ def line_query(
         if set(waypoint) != set(names):
             raise ParameterError(f"pose[{k}]", ", ".join(waypoint), f"poses of {', '.join(names)}")
     frames = [frame_of(robot, name, checker.held, "frame of a line") for name in names]
-    tools = _tools(robot, names, frames)
     q = robot.within_limits(start)
+    tools, held_by = _in_both_hands(checker, _tools(robot, names, frames), q)
     rotation, point = Tools(checker.kernel, tools).poses(q[None])
-    poses = np.tile(np.eye(4), (1 + len(waypoints), len(names), 1, 1))
+    poses = np.tile(np.eye(4), (1 + len(waypoints), len(tools), 1, 1))
     poses[0, :, :3, :3], poses[0, :, :3, 3] = rotation[0], point[0]
     for k, waypoint in enumerate(waypoints, 1):
         for f, name in enumerate(names):
             poses[k, f] = _matrix(waypoint[name], poses[k - 1, f], frames[f].axial, f"pose of {name}")
+        poses[k, len(names) :] = poses[k, held_by]
     goals = [PoseTarget.model_validate({"frame": n, **pose_fields(poses[-1, f])}) for f, n in enumerate(names)]
     if how is not None:
         how.motion_limits(robot, tuple(checker.held.values()))  # checked before planning
-    return LineQuery(problem(goals), q, tools, poses, float(blend), speed, how)
+    return LineQuery(problem(goals), q, tools, names, poses, float(blend), speed, how)
 
 
 def plan_along(checker: CollisionChecker, query: LineQuery, deadline: Deadline, ends: Callable[[], bool]) -> LineResult:
@@ -256,7 +259,7 @@ def _proved(
         check = full_check(tracker.checker, track.states, track.states[0], deadline=deadline.at)
         off = path_deviation(tracker.tools, tracker.path, track.u, track.states)
         if check.timed_out or (check and max(off.position / POSITION, off.angle / ANGLE) > 1.0):
-            return track, None, off, _OUT_OF_TIME  # too few states, as there was no time to refine
+            return track, None, off, _OUT_OF_TIME
         if check:
             return track, check.proof, off, end
         end = DeadEnd(LineEnd.COLLISION, (), check.reason)
@@ -325,7 +328,7 @@ def _with_speed(query: LineQuery, timing: Timing) -> Timing:
     timing = replace(timing, deviation=min(timing.deviation, JOINT_DEVIATION))
     if query.speed is None:
         return timing
-    given, mine = timing.max_tool_speed, {tool.name: query.speed for tool in query.tools}
+    given, mine = timing.max_tool_speed, dict.fromkeys(query.names, query.speed)
     if given is None or isinstance(given, Mapping):
         given = dict(given or {})
         return replace(timing, max_tool_speed=given | {k: min(v, given.get(k, v)) for k, v in mine.items()})
@@ -439,24 +442,71 @@ def _matrix(pose: Any, before: Array, axial: bool, name: str) -> Array:
     return rigid_pose(values, name)
 
 
+def _in_both_hands(checker: CollisionChecker, tools: tuple[Tool, ...], q: Array) -> tuple[tuple[Tool, ...], list[int]]:
+    """Return tools with one more for each object that two links hold, one of them moved by a tool.
+
+    It is fixed to the other link, and where the tool is at the start; so both keep their relative pose where they have
+    the same poses.
+
+    Args:
+        checker: Collision checker with the held objects.
+        tools: The tools.
+        q: The start, shape (dof,).
+
+    Returns:
+        The tools, and the numbers of the tools that the additional ones go with.
+
+    Raises:
+        ParameterError: Both links have tools already.
+    """
+    robot, found, sources = checker.robot, list(tools), list[int]()
+    for held in checker.held.values():
+        arms = [(link, set(_arm(robot, link))) for link in held.links or ()]
+        moving = [[f for f, tool in enumerate(tools) if arm & set(tool.columns.tolist())] for _, arm in arms]
+        if all(moving) and moving:
+            given = " and ".join(tools[f].name for f in sorted({side[0] for side in moving}))
+            raise ParameterError("pose", f"poses of {given}", f"one frame, as two links hold {held.name!r}")
+        for (link, _), mine, other in zip(arms, moving, moving[::-1], strict=True):
+            if mine or not other:
+                continue
+            tool = tools[other[0]]
+            rotation, point = (x[0, other[0]] for x in Tools(checker.kernel, tools).poses(q[None]))
+            placed = np.eye(4)
+            placed[:3, :3], placed[:3, 3] = rotation, point
+            inside = np.linalg.inv(robot.link_pose(q, link)) @ placed
+            found.append(_tool(robot, f"{tool.name} in {link}", link, inside))
+            sources.append(other[0])
+    return tuple(found), sources
+
+
+def _arm(robot: Robot, link: str) -> list[int]:
+    """Return the planned joints that move a link, those of the hands left out."""
+    links, synergies = Links.of(robot), {hand.synergy for hand in robot.hands.values()}
+    joint, _ = links.frame(link, pin.SE3.Identity())
+    return [k for k in links.moved(joint) if robot.joint_names[k] not in synergies]
+
+
 def _tools(robot: Robot, names: Sequence[str], frames: Sequence[Frame]) -> tuple[Tool, ...]:
     """Return the tools of frames by name.
 
     Raises:
         ParameterError: A frame is moved by fewer than six joints, or two share a joint.
     """
-    links, taken = Links.of(robot), dict[int, str]()
-    synergies = {hand.synergy for hand in robot.hands.values()}
-    tools = list[Tool]()
+    taken, tools = dict[int, str](), list[Tool]()
     for name, frame in zip(names, frames, strict=True):
-        joint, pose = links.frame(frame.link, frame.pose)
-        columns = [k for k in links.moved(joint) if robot.joint_names[k] not in synergies]
-        if len(columns) < LEAST_JOINTS:
-            raise ParameterError("frame", name, f"one that {LEAST_JOINTS} joints or more move, not {len(columns)}")
-        for column in columns:
+        tool = _tool(robot, name, frame.link, frame.pose)
+        if len(tool.columns) < LEAST_JOINTS:
+            raise ParameterError("frame", name, f"one that {LEAST_JOINTS} joints or more move, not {len(tool.columns)}")
+        for column in tool.columns.tolist():
             if column in taken:
                 shared = f"{robot.joint_names[column]} moves {taken[column]} too"
                 raise ParameterError("frame", name, f"frames of arms that share no joint ({shared})")
             taken[column] = name
-        tools.append(Tool(name, joint, pose, np.array(columns)))
+        tools.append(tool)
     return tuple(tools)
+
+
+def _tool(robot: Robot, name: str, link: str, pose: Array) -> Tool:
+    """Return the tool that is a frame with a pose in that of a link, shape (4, 4) [m]."""
+    joint, placed = Links.of(robot).frame(link, pin.SE3(pose))
+    return Tool(name, joint, np.array(placed.homogeneous), np.array(_arm(robot, link), np.intp))

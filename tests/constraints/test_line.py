@@ -28,9 +28,9 @@ def tools_of(robot: Robot, *names: str) -> list[Tool]:
     links, found = Links.of(robot), []
     for name in names:
         frame = frame_of(robot, name, {})
-        joint, pose = links.frame(frame.link, frame.pose)
+        joint, pose = links.frame(frame.link, pin.SE3(frame.pose))
         arm = [k for k in links.moved(joint) if "joint" in robot.joint_names[k]]
-        found.append(Tool(name, joint, pose, np.array(arm)))
+        found.append(Tool(name, joint, np.array(pose.homogeneous), np.array(arm)))
     return found
 
 

@@ -15,9 +15,11 @@ from apex_ompl.constraints.line_ends import LineEnd
 from apex_ompl.errors import FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.planning.lines import ANGLE, POSITION, LineResult
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import pose_fields
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
+POINT = (0.4, 0.4, 0.5)
 TURN = (0.2, -0.3, 0.4)
 CUP = {
     "name": "cup", "cylinder": {"radius": 0.03, "length": 0.1}, "position": (0.0, 0.12, 0.05),
@@ -58,6 +60,11 @@ def moved(pose: Array, translation: tuple[float, ...], turn: tuple[float, ...] =
     return made
 
 
+def follow(planner: MotionPlanner, start: Array, pose: Any, **options: Any) -> LineResult:
+    """A plan with time enough on a busy machine."""
+    return planner.plan_line(start, pose, **{"timeout": 120.0} | options)
+
+
 def dense(motion: Trajectory | Array) -> Array:
     """States of a motion, or of straight lines between states, ten times as many as its own."""
     if isinstance(motion, Trajectory):
@@ -95,7 +102,7 @@ def speeds(robot: Robot, motion: Trajectory, name: str) -> Array:
 def test_path_and_motion_keep_the_line(planner: MotionPlanner, robot: Robot) -> None:
     start = hand_pose(robot, robot.home, "left_hand")
     goal = moved(start, (0.1, 0.15, -0.1), TURN)
-    result = planner.plan_line(robot.home, goal, frame="left_hand")
+    result = follow(planner, robot.home, goal, frame="left_hand")
     assert result and result.share == 1.0 and result.end is LineEnd.REACHED and result.partial_motion is None
     assert result.path is not None and result.trajectory is not None
     assert np.array_equal(result.path.states[0], robot.home)
@@ -112,7 +119,7 @@ def test_path_and_motion_keep_the_line(planner: MotionPlanner, robot: Robot) -> 
 
 def test_the_same_line_gives_the_same_path(planner: MotionPlanner, robot: Robot) -> None:
     goal = hand_pose(robot, robot.home, "left_hand")[:3, 3] + (0.1, 0.0, 0.1)
-    first, second = (planner.plan_line(robot.home, goal, frame="left_hand", timing=False) for _ in range(2))
+    first, second = (follow(planner, robot.home, goal, frame="left_hand", timing=False) for _ in range(2))
     assert first.path is not None and second.path is not None and first.trajectory is None
     assert np.array_equal(first.path.states, second.path.states)
 
@@ -121,7 +128,7 @@ def test_the_tool_is_never_faster_than_its_speed(planner: MotionPlanner, robot: 
     start = hand_pose(robot, robot.home, "right_hand")
     goal = PoseTarget(frame="right_hand", position=tuple(start[:3, 3] + (0.0, -0.2, 0.1)))
     for timing in (True, Timing(max_tool_speed=0.5), Timing(max_tool_speed={"right_hand": 0.3})):
-        result = planner.plan_line(robot.home, goal, speed=0.1, timing=timing)
+        result = follow(planner, robot.home, goal, speed=0.1, timing=timing)
         assert result.trajectory is not None
         assert 0.098 < speeds(robot, result.trajectory, "right_hand").max() <= 0.1
 
@@ -130,7 +137,7 @@ def test_a_held_object_goes_along_the_line_by_its_face(planner: MotionPlanner, r
     planner.world.attach(CUP)
     face = robot.link_pose(robot.home, "left_hand_palm") @ np.array([0.0, 0.12, 0.1, 1.0])
     goal = PoseTarget(frame="cup", position=tuple(face[:3] + (0.0, 0.0, 0.15)), orientation=(0.0, 0.0, 0.0, 1.0))
-    result = planner.plan_line(robot.home, goal, speed=0.1)
+    result = follow(planner, robot.home, goal, speed=0.1)
     assert result and result.trajectory is not None
     times = np.linspace(0.0, result.trajectory.duration, 200)
     palms = [robot.link_pose(q, "left_hand_palm") for q in result.trajectory(times)]
@@ -142,7 +149,7 @@ def test_a_held_object_goes_along_the_line_by_its_face(planner: MotionPlanner, r
 
 def test_turns_on_the_spot(planner: MotionPlanner, robot: Robot) -> None:
     start = hand_pose(robot, robot.home, "left_hand")
-    result = planner.plan_line(robot.home, moved(start, (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), frame="left_hand")
+    result = follow(planner, robot.home, moved(start, (0.0, 0.0, 0.0), (0.0, 0.0, 0.5)), frame="left_hand")
     assert result.trajectory is not None
     poses = hand_poses(robot, dense(result.trajectory), "left_hand")
     assert max(np.linalg.norm(pose[:3, 3] - start[:3, 3]) for pose in poses) < POSITION
@@ -154,18 +161,38 @@ def test_two_arms_go_in_step(planner: MotionPlanner, robot: Robot) -> None:
     first = {name: hand_pose(robot, robot.home, name) for name in robot.hands}
     last = {name: moved(pose, (0.1, 0.0, 0.1), TURN) for name, pose in first.items()}
     last["right_hand"] = moved(first["right_hand"], (0.05, -0.1, 0.0))
-    result = planner.plan_line(robot.home, last)
+    result = follow(planner, robot.home, last)
     assert result.trajectory is not None
     shares = [check(robot, dense(result.trajectory), name, first[name], last[name]) for name in robot.hands]
     assert np.abs(shares[0] - shares[1]).max() < 2e-3
+
+
+def test_two_hands_carry_one_object(planner: MotionPlanner, robot: Robot) -> None:
+    palms = [robot.link_pose(robot.home, f"{side}_hand_palm") for side in ("left", "right")]
+    middle = np.eye(4)
+    middle[:3, 3] = 0.5 * (palms[0] + palms[1])[:3, 3]
+    bar = {"name": "bar", "box": (0.05, 0.5, 0.03), "links": ("left_hand_palm", "right_hand_palm")}
+    planner.world.attach(bar | pose_fields(np.linalg.inv(palms[0]) @ middle))
+    goal = moved(middle, (0.1, 0.05, 0.1), (0.0, 0.1, 0.2))
+    result = follow(planner, robot.home, goal, frame="bar", speed=0.2)
+    assert result and result.trajectory is not None
+    for q in result.trajectory(np.linspace(0.0, result.trajectory.duration, 50)):
+        left, right = (robot.link_pose(q, f"{side}_hand_palm") for side in ("left", "right"))
+        apart = pin.log6(pin.SE3(np.linalg.inv(palms[0]) @ palms[1]).actInv(pin.SE3(np.linalg.inv(left) @ right)))
+        assert np.linalg.norm(apart.linear) < 1e-3 and np.linalg.norm(apart.angular) < 2.0 * ANGLE
+    assert np.allclose(left @ np.linalg.inv(palms[0]) @ middle, goal, atol=1e-6)
+    with pytest.raises(
+        ParameterError, match="expected one frame, as two links hold 'bar', got 'poses of left_hand and"
+    ):
+        follow(planner, robot.home, {"left_hand": POINT, "right_hand": POINT})
 
 
 def test_blends_stay_inside_their_radius_and_are_faster(planner: MotionPlanner, robot: Robot) -> None:
     start = hand_pose(robot, robot.home, "left_hand")
     corner = moved(start, (0.15, 0.0, -0.1), TURN)
     goal = moved(corner, (0.0, 0.2, 0.0))
-    stopping = planner.plan_line(robot.home, [corner, goal], frame="left_hand")
-    blended = planner.plan_line(robot.home, [corner, goal], frame="left_hand", blend=0.05)
+    stopping = follow(planner, robot.home, [corner, goal], frame="left_hand")
+    blended = follow(planner, robot.home, [corner, goal], frame="left_hand", blend=0.05)
     assert stopping.trajectory is not None and blended.trajectory is not None
     assert blended.trajectory.duration < stopping.trajectory.duration
     for result, radius in ((stopping, 0.0), (blended, 0.05)):
@@ -186,7 +213,7 @@ def test_a_blocked_line_ends_at_the_bodies(planner: MotionPlanner, robot: Robot,
     start = hand_pose(robot, robot.home, "left_hand")
     planner.world.add(name="wall", box=(0.05, 1.0, 1.0), position=(start[0, 3] + 0.3, start[1, 3], start[2, 3]))
     goal = moved(start, (0.3, 0.0, 0.0))
-    result = planner.plan_line(robot.home, goal, frame="left_hand")
+    result = follow(planner, robot.home, goal, frame="left_hand")
     assert not result and result.status is PlanStatus.APPROXIMATE_SOLUTION and 0.1 < result.share < 0.9
     assert result.end is LineEnd.COLLISION and result.blocked_by[1] == "wall" and "wall" in result.reason
     assert result.trajectory is None and result.partial_motion is not None and result.path is not None
@@ -207,19 +234,19 @@ def test_a_blocked_line_ends_at_the_bodies(planner: MotionPlanner, robot: Robot,
 def test_a_line_beyond_reach_says_how_far_it_gets(planner: MotionPlanner, robot: Robot) -> None:
     start = hand_pose(robot, robot.home, "left_hand")
     goal = moved(start, (0.8, 0.0, 0.0))
-    result = planner.plan_line(robot.home, goal, frame="left_hand", timing=False)
+    result = follow(planner, robot.home, goal, frame="left_hand", timing=False)
     assert result.end is LineEnd.UNREACHABLE and "left_hand cannot reach" in result.reason
     assert result.path is not None and 0.2 < result.share < 1.0
     assert check(robot, dense(result.path.states), "left_hand", start, goal)[-1] == pytest.approx(result.share)
     near = moved(start, (0.8 * result.share - 2e-3, 0.0, 0.0))
-    assert planner.plan_line(robot.home, near, frame="left_hand", timing=False)
+    assert follow(planner, robot.home, near, frame="left_hand", timing=False)
 
 
 def test_redundancy_avoids_a_limit_that_the_pseudoinverse_meets(planner: MotionPlanner, robot: Robot) -> None:
     start = robot.home.copy()
     start[6] = robot.limits.upper[6] - 0.05
     goal = moved(hand_pose(robot, start, "left_hand"), (0.0, 0.15, 0.0))
-    result = planner.plan_line(start, goal, frame="left_hand", timing=False)
+    result = follow(planner, start, goal, frame="left_hand", timing=False)
     assert result and result.path is not None and (result.path.states <= robot.limits.upper).all()
     state, frame = robot.to_pinocchio(start), robot.link_frame("left_hand_palm")
     data, tool = robot.model.createData(), pin.SE3(np.eye(3), np.asarray(robot.hands["left_hand"].point))
@@ -234,7 +261,7 @@ def test_redundancy_avoids_a_limit_that_the_pseudoinverse_meets(planner: MotionP
 
 
 def test_a_line_to_where_the_tool_is(planner: MotionPlanner, robot: Robot) -> None:
-    result = planner.plan_line(robot.home, hand_pose(robot, robot.home, "left_hand"), frame="left_hand")
+    result = follow(planner, robot.home, hand_pose(robot, robot.home, "left_hand"), frame="left_hand")
     assert result and result.share == 1.0 and result.trajectory is not None and result.path is not None
     assert np.array_equal(result.path.states, robot.home[None])
 
@@ -242,17 +269,16 @@ def test_a_line_to_where_the_tool_is(planner: MotionPlanner, robot: Robot) -> No
 def test_invalid_starts_and_spent_time_are_statuses(planner: MotionPlanner, robot: Robot) -> None:
     goal, outside = hand_pose(robot, robot.home, "left_hand")[:3, 3] + 0.1, robot.home.copy()
     outside[3] = 1.0
-    result = planner.plan_line(outside, goal, frame="left_hand")
+    result = follow(planner, outside, goal, frame="left_hand")
     assert result.status is PlanStatus.INVALID_START and result.end is LineEnd.JOINT_LIMIT and result.path is None
     planner.world.add(name="wall", box=(0.2, 0.2, 0.2), position=hand_pose(robot, robot.home, "left_hand")[:3, 3])
-    result = planner.plan_line(robot.home, goal, frame="left_hand")
+    result = follow(planner, robot.home, goal, frame="left_hand")
     assert result.status is PlanStatus.INVALID_START and result.end is LineEnd.COLLISION
     planner.world.clear()
     result = planner.plan_line(robot.home, goal, frame="left_hand", timeout=1e-4)
     assert result.status is PlanStatus.TIMEOUT and result.end is LineEnd.TIMEOUT and result.share == 0.0
 
 
-POINT = (0.4, 0.4, 0.5)
 FAULTY = [
     (POINT, {"frame": "left_hnd"}, UnknownNameError, "unknown frame of a line 'left_hnd', did you mean 'left_hand'"),
     (POINT, {}, ParameterError, "frame: expected the name of a hand, a link or a held object, got None"),
@@ -295,11 +321,11 @@ FAULTY = [
 def test_bad_input_is_refused_in_one_sentence(planner: MotionPlanner, robot: Robot, case: tuple[Any, ...]) -> None:
     pose, options, kind, message = case
     with pytest.raises(kind, match=message) as caught:
-        planner.plan_line(robot.home, pose, **options)
+        follow(planner, robot.home, pose, **options)
     assert "\n" not in str(caught.value)
 
 
 def test_obstacles_that_move_are_refused(planner: MotionPlanner, robot: Robot) -> None:
     planner.world.add(name="ball", sphere={"radius": 0.05}, position=(2.0, 0.0, 0.5), velocity=(-0.1, 0.0, 0.0))
     with pytest.raises(ParameterError, match='world: expected obstacles that stand still, got "the moving obstacle'):
-        planner.plan_line(robot.home, POINT, frame="left_hand")
+        follow(planner, robot.home, POINT, frame="left_hand")
