@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.constraints.frames import frame_of
+from apex_ompl.evaluation.rows import Job
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length, states_between
 from apex_ompl.robot import Robot
@@ -30,6 +32,8 @@ from apex_ompl.util.clocks import timed
 DENSE = SEARCH_RESOLUTION / 20.0  # spacing of the states of the check [rad, max-norm]
 REFINED = 0.01  # of those of a rival's path after refinement [rad, max-norm]
 SLACK = 1e-9  # by which a violation may pass its tolerance, for rounding [m, rad]
+
+WARM_UP = "carry_tray"  # problem of the runs that load code
 
 Residual = Callable[[Mapping[str, Array]], float]
 """Distance or angle from what is wanted, over its tolerance, by the poses of frames."""
@@ -148,6 +152,11 @@ def _relative(constraint: RelativePose, start: Mapping[str, Array]) -> Residual:
         return max(off, _turned(wanted, found) / tolerance.angle)
 
     return worst
+
+
+def problem_of(job: Job) -> Problem:
+    """Return the problem of a run; that of a run to warm up has constraints, too."""
+    return load_problem(WARM_UP if job.experiment == "warm-up" else job.problem)
 
 
 def arm_joints(ready: PlanningSetup) -> Array:
