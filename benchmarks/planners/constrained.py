@@ -155,7 +155,8 @@ def summary(runs: Sequence[Run], base: Mapping[str, float]) -> dict[str, Any]:
     violations = [run["violation"] for run in runs if run.get("violation") is not None and run["solved"]]
     durations = [run["duration"] for run in found.solved if run.get("duration") is not None]
     return {
-        "n": len(runs), "solved": len(found.solved) / len(runs), "interval": share_interval(len(found.solved), len(runs)),
+        "n": len(runs), "solved": len(found.solved) / len(runs),
+        "interval": share_interval(len(found.solved), len(runs)),
         "first_s": [record.reached(found.times("first"), p) for p in (50, 95)],
         "end_s": record.reached(found.times("total"), 50), "failed_check": sum(run["failed_check"] for run in runs),
         "violation": max(violations, default=None), "length": found.median("length"),

@@ -24,7 +24,7 @@ from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length, states_between
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import pose_matrix
-from apex_ompl.scene.constraints import WORLD, FixedOrientation, OnLine, OnPlane, RelativePose, Upright
+from apex_ompl.scene.constraints import WORLD, FixedOrientation, OnLine, OnPlane, RelativePose, ToolRegion, Upright
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
@@ -93,6 +93,22 @@ def _unit(vector: Any) -> Array:
     return np.asarray(vector, float) / np.linalg.norm(vector)
 
 
+def _region(constraint: ToolRegion) -> Residual:
+    origin = pose_matrix(constraint.position, constraint.orientation)
+
+    def worst(poses: Mapping[str, Array]) -> float:
+        found = np.linalg.inv(origin) @ poses[constraint.frame]
+        off = 0.0 if constraint.angle is None else _turned(np.eye(4), found) / constraint.angle
+        for value, low, high in zip(found[:3, 3], constraint.lower, constraint.upper, strict=True):
+            if low is not None and high is not None:
+                off = max(off, abs(value - (low + high) / 2.0) / ((high - low) / 2.0))
+            elif (low is not None and value < low) or (high is not None and value > high):
+                off = np.inf
+        return float(off)
+
+    return worst
+
+
 def frames_of(constraint: Any) -> tuple[str, ...]:
     """Return the names of the frames of a constraint but for the world."""
     names = (constraint.first, constraint.second) if isinstance(constraint, RelativePose) else (constraint.frame,)
@@ -130,6 +146,8 @@ def residual_of(constraint: Any, start: Mapping[str, Array]) -> Residual:
         if constraint.orientation is not None:
             wanted = pose_matrix((0.0, 0.0, 0.0), constraint.orientation)
         return lambda p: _turned(wanted, p[constraint.frame]) / constraint.angle
+    if isinstance(constraint, ToolRegion):
+        return _region(constraint)
     raise NotImplementedError(f"no dense check of {type(constraint).__name__}")
 
 
@@ -193,7 +211,7 @@ def dense_check(robot: Robot, problem: Problem, path: Array, spacing: float = DE
     worst = 0.0
     for q in states:
         poses = reader(q, names)
-        worst = max(worst, *(residual(poses) for residual in residuals))
+        worst = max([worst, *(residual(poses) for residual in residuals)])
     checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
     return DenseCheck(len(states), worst, bool(checker.are_free(states).all()))
 
