@@ -53,17 +53,24 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
 
 
 @unforked()
-def setup(problem: Problem | str | os.PathLike[str]) -> og.SimpleSetup:
+def setup(
+    problem: Problem | str | os.PathLike[str], *, constraints: Sequence[Constraint | UserConstraint] = ()
+) -> og.SimpleSetup:
     """Return OMPL's SimpleSetup of a problem, for planners and tools of OMPL's own.
 
     Space, checker, motion validator, start and goals are set, and the default planner is allocated unless another one
     is set. Dynamic obstacles stand where they are at time 0.
 
+    Args:
+        problem: A problem, its name, or its file.
+        constraints: Constraints along the path besides those of the problem; with any, the space is OMPL's projected
+            one, see :meth:`apex_ompl.MotionPlanner.simple_setup`.
+
     Raises:
-        ApexError: The problem is unknown or faulty.
+        ApexError: The problem or a constraint is unknown or faulty.
     """
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
-    ready = assemble(loaded)
+    ready = assemble(loaded, constraints=constraints)
     simple_setup = ready.simple_setup
     simple_setup.setPlannerAllocator(planners.allocator(NAME))
     return simple_setup

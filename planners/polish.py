@@ -7,13 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.ompl.own_planner import OwnPlanner
+from apex_ompl.constraints.constraint_set import ConstraintSet
+from apex_ompl.constraints.paths import ConstrainedPaths
+from apex_ompl.ompl.constrained_space import RANGE
+from apex_ompl.ompl.own_planner import OwnPlanner, Status
 from apex_ompl.ompl.parameters import Parameters, bounded, register
-from apex_ompl.ompl.repair import simplify
+from apex_ompl.ompl.repair import exact_paths, simplify
 from apex_ompl.ompl.space import await_goal, path_to_array
 from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
@@ -79,6 +83,8 @@ class PolishedRRTConnect(OwnPlanner):
             return status.getStatus()
         dof = self.validator.checker.robot.dof
         self.report.first_path = path = Path(path_to_array(pdef.getSolutionPath(), dof))
+        if self.validator.constraints is not None:
+            return self._on_constraints(self.validator.constraints, path.states, started, ptc)
         with self.report.timed("simplify"):
             for _ in range(TRIES):
                 short = Path(simplify(si, path.states, lambda: bool(ptc())))
@@ -94,6 +100,33 @@ class PolishedRRTConnect(OwnPlanner):
                 self.report.add_solution(self, better, time.perf_counter() - started)
         return status.getStatus()
 
+    def _on_constraints(
+        self, constraints: ConstraintSet, nodes: Array, started: float, ptc: ob.PlannerTerminationCondition
+    ) -> Any:
+        """Add paths that keep the constraints in place of the nodes that RRTConnect found, and return the status."""
+        validator, rng = self.validator, np.random.default_rng(0)
+
+        def stop() -> bool:
+            return bool(ptc())
+
+        self.getProblemDefinition().clearSolutionPaths()
+        with self.report.timed("simplify"):
+            exact = exact_paths(validator.checker, constraints, nodes, rng=rng, stop=stop)
+            valid = next((Path(states) for states in exact if validator.is_valid(states, stop)), None)
+        if valid is None:
+            self.report.reason = "the path found is not valid between its states"
+            return Status.TIMEOUT
+        self.report.add_solution(self, valid, time.perf_counter() - started)
+        paths = ConstrainedPaths(
+            validator.kernel, constraints, self._optimizer, lambda states: validator.is_valid(states, stop), stop
+        )
+        if not ptc():
+            with self.report.timed("polish"):
+                better = paths.shortened(paths.fit(valid.states))
+            if better is not None:
+                self.report.add_solution(self, Path(better[1]), time.perf_counter() - started)
+        return Status.EXACT_SOLUTION
+
     def _inner_planners(self) -> list[ob.Planner]:
         return [self._inner]
 
@@ -102,6 +135,8 @@ class PolishedRRTConnect(OwnPlanner):
 @dataclass(frozen=True)
 class RRTConnectPolish(Parameters):
     """RRTConnect, simplified, fitted by a B-spline and optimized on its control points.
+
+    Under constraints along the path, it is simplified by shortcuts on the constraints.
 
     Attributes:
         range: Longest step of RRTConnect's trees, by default the tuned one; 0 lets OMPL choose.
@@ -113,6 +148,7 @@ class RRTConnectPolish(Parameters):
     """
 
     smooth: ClassVar[bool] = True
+    constrained: ClassVar[bool] = True
     range: float = bounded(TUNED[NAME]["range"], 0.0, unit="rad")
     control_points: int = bounded(14, 6, 200)
     pinned: int = bounded(1, 1, 90)
@@ -135,12 +171,12 @@ class RRTConnectPolish(Parameters):
         Raises:
             ParameterError: ``si`` has neither a validity checker of this project nor is it of ``apex_ompl.setup``.
         """
-        validator = PathValidator.of_setup(si, NAME)
+        validator = PathValidator.of_setup(si, NAME, constrained=True)
         settings = OptimizerSettings(
             scene_margin=self.scene_margin, own_margin=self.own_margin, stiffness=self.stiffness
         )
         optimizer = Optimizer(Spline(self.control_points, self.pinned), settings)
         optimizer.prepare(validator.kernel)
         inner = og.RRTConnect(si)
-        inner.setRange(self.range)
+        inner.setRange(self.range if validator.constraints is None else RANGE)
         return PolishedRRTConnect(si, validator, optimizer, inner)

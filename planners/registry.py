@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.parameters import REGISTRY, Parameters, Value
@@ -20,6 +20,8 @@ AnyPlanner = str | Parameters | Callable[["ob.SpaceInformation"], "ob.Planner"]
 
 class MadeByFunction(Parameters):
     """A planner that a user's function makes."""
+
+    constrained: ClassVar[bool] = True
 
     def __init__(self, make: Callable[[ob.SpaceInformation], ob.Planner]) -> None:
         """Make the planner by a function of OMPL's space information."""

@@ -1,6 +1,7 @@
 """OMPL's sampling-based planners: every geometric planner that its Python bindings have.
 
-The defaults are OMPL's own; a range of 0 lets OMPL choose one from the size of the space (a fifth of its extent).
+The defaults are OMPL's own; a range of 0 lets OMPL choose one from the size of the space (a fifth of its extent), and
+is ``RANGE`` under constraints along the path.
 ``apex_ompl.planners.TUNED`` has parameters that suit the suites of problems.
 """
 
@@ -12,6 +13,7 @@ from typing import ClassVar
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.ompl.constrained_space import RANGE, refuse_constraints
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 
 UNIT = "rad"
@@ -29,12 +31,21 @@ class OmplParameters(Parameters):
     """Parameters of a planner of OMPL's own, set through its setters."""
 
     planner: ClassVar[str]
+    constrained: ClassVar[bool] = True
 
     def build(self, si: ob.SpaceInformation) -> ob.Planner:
-        """Return OMPL's planner with these parameters."""
+        """Return OMPL's planner with these parameters.
+
+        Raises:
+            ParameterError: There are constraints along the path, under which the planner does not plan.
+        """
+        if not self.constrained:
+            refuse_constraints(si, self.name)
         planner = getattr(og, self.planner)(si)
         for field in fields(self):
             getattr(planner, "set" + setter_stem(field.name))(getattr(self, field.name))
+        if getattr(self, "range", None) == 0.0 and isinstance(si.getStateSpace(), ob.ConstrainedStateSpace):
+            planner.setRange(RANGE)
         return planner
 
 
@@ -103,6 +114,7 @@ class AORRTC(OmplParameters):
     """RRTConnect made almost-surely asymptotically optimal (Wilson et al., 2025)."""
 
     planner: ClassVar[str] = "AORRTC"
+    constrained: ClassVar[bool] = False
     optimizing: ClassVar[bool] = True
     repeatable: ClassVar[bool] = False
     range: float = bounded(0.0, 0.0, unit=UNIT)

@@ -11,8 +11,6 @@ from ompl import base as ob
 
 from apex_ompl.apex.models import make_query, rough_kernel
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.constraints.paths import ConstrainedPaths
-from apex_ompl.constraints.proof import prove_path
 from apex_ompl.ompl.own_planner import SolveReport
 from apex_ompl.paths.candidates import Candidate, CandidatePool
 from apex_ompl.paths.optimizer import Optimizer
@@ -24,6 +22,7 @@ if TYPE_CHECKING:
 
     from apex_ompl.apex.models import ProposalSampler
     from apex_ompl.apex.stages.trees import OmplTrees
+    from apex_ompl.constraints.paths import ConstrainedPaths
     from apex_ompl.kernel.constraints import ConstrainedTreePair
     from apex_ompl.kernel.search import SearchCounts, TreePair
     from apex_ompl.model.query import Query
@@ -94,6 +93,8 @@ class SolveContext:
         self.grown: list[TreePair | og.RRTConnect] = []
         self.constrained: ConstrainedPaths | None = None
         if validator.constraints is not None:
+            from apex_ompl.constraints.paths import ConstrainedPaths
+
             self.constrained = ConstrainedPaths(
                 self.kernel, validator.constraints, optimizer, lambda states: validator.is_valid(states, self.stop),
                 self.stop,
@@ -126,8 +127,11 @@ class SolveContext:
     def is_valid(self, states: Array) -> bool:
         """Whether a path, shape (N, dof), passes the full check."""
         constraints = self.validator.constraints
-        if constraints is not None and not prove_path(constraints, states):
-            return False
+        if constraints is not None:
+            from apex_ompl.constraints.proof import prove_path
+
+            if not prove_path(constraints, states):
+                return False
         return self.validator.is_valid(states, self.stop)
 
     def new_pool(self) -> CandidatePool:

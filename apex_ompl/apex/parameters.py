@@ -67,6 +67,7 @@ class ApexParameters(Parameters):
     """
 
     smooth: ClassVar[bool] = True
+    constrained: ClassVar[bool] = True
     model: str = AUTO
     robot: str = AUTO
     device: str = "cpu"

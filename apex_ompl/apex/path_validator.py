@@ -4,26 +4,29 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ompl import base as ob
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
-from apex_ompl.ompl.simple_setup import SpaceInformation
-from apex_ompl.ompl.space import bounds_of, require_real_vectors, to_state
+from apex_ompl.ompl.constrained_space import constraint_of, refuse_constraints
+from apex_ompl.ompl.simple_setup import RobotSpaceInformation
+from apex_ompl.ompl.space import ambient_space, bounds_of, require_real_vectors, to_state
 from apex_ompl.ompl.validity import MotionValidator, StateValidityChecker, forwarding
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.types import Array, Flags
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 Stop = Callable[[], bool]
 NOT_ACCEPTED = "the state validity checker that is set does not accept the path"
 
 LOG = logging.getLogger("apex_ompl")
-PLAIN = (ob.MotionValidator, MotionValidator)  # OMPL's own, and this project's
+PLAIN = (ob.MotionValidator, ob.ConstrainedMotionValidator, MotionValidator)  # OMPL's own, and this project's
 STRIDE = 8  # of the states of a path that are checked before its motions
 DEFAULT_ROBOT = "dual_panda_softhand"
 
@@ -41,7 +44,7 @@ class PathValidator:
         checker: Collision checker of the robot, among its obstacles where they are known.
         knows_obstacles: Whether the obstacles are known.
         exclusive: Whether this project's checker alone decides.
-        constraints: Constraints along paths, of this project's checker, or None where there are none.
+        constraints: Constraints along paths, of this project's checker or of the state space, or None for none.
     """
 
     def __init__(self, si: ob.SpaceInformation, robot: str = "") -> None:
@@ -54,9 +57,11 @@ class PathValidator:
 
         Raises:
             ApexError: There is no such robot.
-            ParameterError: The space is not one of real vectors, or has another dimension than the robot.
+            ParameterError: The space is neither one of real vectors nor one of these under constraints of
+                :class:`apex_ompl.ompl.constrained_space.ManifoldConstraint`, or has another dimension than the robot.
         """
-        require_real_vectors(si.getStateSpace())
+        require_real_vectors(ambient_space(si.getStateSpace()))
+        constraint = constraint_of(si.getStateSpace())
         self._si, self._robot = si, robot
         self._checkers = _checkers(si)
         self._bounded: tuple[tuple[Any, ...], Kernel] | None = None  # what it was made of, and the kernel
@@ -64,9 +69,9 @@ class PathValidator:
         plain = type(motions) in PLAIN
         self.si = si if plain else forwarding(si, walks=True)
         self.knows_obstacles = isinstance(validity_checker, StateValidityChecker)
-        self.constraints: ConstraintSet | None = None
+        self.constraints: ConstraintSet | None = None if constraint is None else constraint.constraints
         if isinstance(validity_checker, StateValidityChecker):
-            self.checker, self.constraints = validity_checker.checker, validity_checker.constraints
+            self.checker, self.constraints = validity_checker.checker, validity_checker.constraints or self.constraints
             self.exclusive = type(validity_checker).isValid is StateValidityChecker.isValid and plain
         else:
             self.checker, self.exclusive = CollisionChecker(_robot_of(si, robot)), False
@@ -81,14 +86,22 @@ class PathValidator:
             )
 
     @classmethod
-    def of_setup(cls, si: ob.SpaceInformation, planner: str) -> PathValidator:
+    def of_setup(cls, si: ob.SpaceInformation, planner: str, *, constrained: bool = False) -> PathValidator:
         """Return a validator for a planner that is given no robot.
 
+        Args:
+            si: OMPL's space information.
+            planner: Name of the planner.
+            constrained: Whether it plans under constraints along the path.
+
         Raises:
-            ParameterError: ``si`` has neither a checker of this project nor is it of ``apex_ompl.setup``.
+            ParameterError: ``si`` has neither a checker of this project nor is it of ``apex_ompl.setup``, or it has
+                constraints that the planner does not know.
         """
+        if not constrained:
+            refuse_constraints(si, planner)
         checker = si.getStateValidityChecker()
-        if not isinstance(checker, StateValidityChecker) and not isinstance(si, SpaceInformation):
+        if not isinstance(checker, StateValidityChecker) and not isinstance(si, RobotSpaceInformation):
             expected = "apex_ompl's StateValidityChecker, or any other in a setup of apex_ompl.setup"
             raise ParameterError(f"state validity checker for {planner}", type(checker).__name__, expected)
         return cls(si)
@@ -158,7 +171,7 @@ class PathValidator:
 
 def _robot_of(si: ob.SpaceInformation, robot: str) -> Robot:
     """Return the robot of a space information by name, or that of its setup, or the default one."""
-    if not robot and isinstance(si, SpaceInformation):
+    if not robot and isinstance(si, RobotSpaceInformation):
         return si.robot
     return load_robot(robot or DEFAULT_ROBOT)
 

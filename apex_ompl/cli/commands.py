@@ -57,7 +57,7 @@ def check(parsed: argparse.Namespace) -> int:
     moving = f", moving: {', '.join(problem.moving)}" if problem.moving else ""
     print(f"  scene      {len(problem.scene)} obstacles{moving}")
     if problem.attached:
-        print("  held       " + ", ".join(f"{held.name} by {held.link}" for held in problem.attached))
+        print("  held       " + ", ".join(f"{held.name} by {' and '.join(held.holders)}" for held in problem.attached))
     print(f"  start      {setup.start_fault or 'free'}")
     goal_faults, note = setup.goal_faults, ""
     if problem.moving:  # an obstacle at the goal at time 0 may have left when the robot arrives

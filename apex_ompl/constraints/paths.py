@@ -7,7 +7,7 @@ tolerances.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import inf
 
 import numpy as np
@@ -30,7 +30,7 @@ SPACINGS = (0.02, 0.01, 0.005)  # of exact states, in turn until the constraints
 LEAST_STATES = 129  # of a path of control points
 MOVED = 0.1  # largest movement of a state by its projection [rad, max-norm]
 JUMP = 3.0  # largest distance of neighboring states, as a multiple of their spacing
-STIFFNESSES = (25.0, 5.0, 1.0)  # factors on the stiffness in shortening
+STIFFNESSES = (25.0, 5.0)  # factors on the stiffness in shortening
 MIN_GAIN = 1e-3  # least decrease of length [rad]
 
 
@@ -111,12 +111,13 @@ class ConstrainedPaths:
                 return found if self.is_valid(found) else None
         return None
 
-    def improved(self, control: Array, stiffness: float = 1.0) -> Array | None:
+    def improved(self, control: Array, stiffness: float = 1.0, weights: Sequence[float] = WEIGHTS) -> Array | None:
         """Return control points, shape (points, dof), of a path near the constraints and clear of obstacles, or None.
 
         Args:
             control: First control points.
             stiffness: Factor on the stiffness.
+            weights: Weights of the constraints, in one round after the other.
         """
         if self.constraints.user:
             return self._improved_in_python(control, stiffness)
@@ -130,7 +131,7 @@ class ConstrainedPaths:
             settings.scene_margin, settings.own_margin, stiffness * settings.stiffness, settings.damping, inf,
             settings.tolerance, PART,
         )  # fmt: skip
-        for weight in WEIGHTS:
+        for weight in weights:
             damping = settings.damping
             for _ in range(0, settings.steps, PART):
                 if self.stop():
@@ -158,15 +159,16 @@ class ConstrainedPaths:
         return None if now is None or states is None else (now, states)
 
     def shortened(self, control: Array) -> tuple[Array, Array] | None:
-        """Return control points and states of a valid path that is stiffer, or None where none is valid."""
+        """Return control points and states of a valid path, made stiffer where that is valid, or None."""
+        found = self.repaired(control)
+        if found is None:
+            return None
         for factor in STIFFNESSES:
-            now = self.improved(control, factor)
-            if now is None:
-                return None
-            states = self.of_control(now)
-            if states is not None:
+            now = self.improved(found[0], factor, WEIGHTS[-1:])
+            states = None if now is None else self.of_control(now)
+            if now is not None and states is not None:
                 return now, states
-        return None
+        return found
 
     def fit(self, nodes: Array) -> Array:
         """Return control points, shape (points, dof), of the spline nearest to states, shape (N, dof)."""

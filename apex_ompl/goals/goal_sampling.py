@@ -11,17 +11,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.goals.alignment import within
 from apex_ompl.kernel import IKDescents, IKSolver
 from apex_ompl.robot import Robot
 from apex_ompl.robot.rest_to_rest import direct_durations, direct_reach
 from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 BATCH = 32  # descents at once
 FEW = 64  # descents after which one free state is enough

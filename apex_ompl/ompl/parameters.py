@@ -30,6 +30,7 @@ class Parameters:
             or threaded.
         smooth: Whether its paths are short and smooth already, and shortcuts would only break them.
         threaded: Whether the planner runs threads of its own; OMPL 2.0.1's then deadlock over several goals.
+        constrained: Whether it plans under constraints along the path.
     """
 
     name: ClassVar[str] = ""
@@ -37,6 +38,7 @@ class Parameters:
     repeatable: ClassVar[bool] = True
     smooth: ClassVar[bool] = False
     threaded: ClassVar[bool] = False
+    constrained: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check the values.

@@ -5,17 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from typing import TYPE_CHECKING
 
 import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.ompl.process import Interrupt, ends_after
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.simple_setup import SimpleSetup
 from apex_ompl.ompl.space import array_to_path, path_to_array, to_state
 from apex_ompl.ompl.validity import (
+    ConstrainedMotionCheck,
     FullCheck,
     MotionProof,
     MotionValidator,
@@ -24,8 +27,12 @@ from apex_ompl.ompl.validity import (
     full_check,
     motions_until,
 )
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import Path, path_length
 from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 ROUNDS = 6
 MIN_GAIN = 0.01  # a round that shortens by less than this share is the last
@@ -61,6 +68,39 @@ def simplify(si: ob.SpaceInformation, path: Array, stop: Callable[[], bool] = la
             if gain < MIN_GAIN:
                 break
     return np.concatenate([path[:1], best[1:-1], path[-1:]])
+
+
+DRAWS = 40  # of shortcuts on constraints
+
+
+def exact_paths(
+    checker: CollisionChecker, constraints: ConstraintSet, nodes: Array, *,
+    rng: np.random.Generator | None = None, stop: Callable[[], bool] = lambda: False,
+) -> list[Array]:  # fmt: skip
+    """Return paths that are proved to keep constraints, shape (N, dof) each, of one in a projected state space.
+
+    They are not checked for collisions.
+
+    Args:
+        checker: Collision checker, for shortcuts.
+        constraints: The constraints.
+        nodes: States whose motions were found valid, shape (N, dof).
+        rng: Source of shortcuts, whose path comes first; None for no shortcuts.
+        stop: Asked whether to end shortcuts.
+    """
+    from apex_ompl.constraints.paths import ConstrainedPaths
+
+    paths = ConstrainedPaths(checker.kernel, constraints, Optimizer(), lambda states: True, stop)
+    several = [nodes]
+    if rng is not None and not constraints.user:
+        several.insert(0, paths.shortcut(nodes, DRAWS, rng))
+    found = []
+    for some in several:
+        states = ConstrainedMotionCheck(checker, constraints).along(some)
+        exact = None if states is None else paths.along(states)
+        if exact is not None:
+            found.append(exact)
+    return found
 
 
 MAX_BRIDGES = 20

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+from weakref import ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,21 +13,23 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.user import UserConstraint
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.goal_sampling import sample, sample_on_constraints
 from apex_ompl.goals.pose_goal import PoseGoal
+from apex_ompl.ompl.constrained_space import constraint_of
 from apex_ompl.ompl.simple_setup import SimpleSetup
 from apex_ompl.ompl.space import Bounds, to_state
-from apex_ompl.ompl.validity import MotionCheck, MotionValidator, StateValidityChecker
-from apex_ompl.paths.path import SEARCH_RESOLUTION
+from apex_ompl.ompl.validity import ConstrainedMotionCheck, MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.user import UserConstraint
 
 GOAL_STATES = 8  # how many states an alignment goal is sampled into
 GOAL_ATTEMPTS = 200
@@ -85,7 +89,8 @@ class PlanningSetup:
 
     def raise_faults(self) -> None:
         """Raise the exception that the checkers kept inside of OMPL's callbacks, such as Ctrl-C."""
-        fault = self.validity_checker.fault or self.motion_validator.fault
+        constraint = constraint_of(self.simple_setup.getStateSpace())
+        fault = self.validity_checker.fault or self.motion_validator.fault or (constraint and constraint.fault)
         if fault is not None:
             raise fault
 
@@ -150,13 +155,18 @@ def assemble(
         goals = sampling.states
         goals[:, held] = start[held]
         goal_faults = ("",) * len(goals) or (sampling.fault,)
-    simple_setup = SimpleSetup(robot, bounds)
+    if along is not None:
+        bounds = _bounds(robot, start, _resting(along, start, goals, held))
+    simple_setup = SimpleSetup(robot, bounds, along)
     si = simple_setup.getSpaceInformation()
-    check = MotionCheck(checker, SEARCH_RESOLUTION)
+    check = MotionCheck(checker) if along is None else ConstrainedMotionCheck(checker, along)
     validity_checker = StateValidityChecker(si, checker, along)
     motion_validator = MotionValidator(si, check, validity_checker)
     simple_setup.setStateValidityChecker(validity_checker)
     si.setMotionValidator(motion_validator)
+    constraint = constraint_of(si.getStateSpace())
+    if constraint is not None:
+        constraint.stop = _stop_of(motion_validator)
     simple_setup.setStartState(to_state(si, start))
     start_off, goals_off = "", ("",) * len(goals)
     if along is not None:
@@ -205,6 +215,8 @@ def constraint_set(
     """
     if not (problem.constraints or constraints or any(one.links is not None for one in problem.attached)):
         return None
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+
     hands = (hand.synergy for hand in robot.hands.values() if hand.synergy is not None)
     fixed = sorted({*held.tolist(), *(robot.joint_names.index(name) for name in hands)})
     return ConstraintSet.of(robot, (*problem.constraints, *constraints), problem.attached, start, fixed)
@@ -225,6 +237,23 @@ def _bounds(robot: Robot, start: Array, held: NDArray[np.intp]) -> Bounds:
     lower[held] = np.maximum(lower[held], start[held] - HELD_WIDTH)
     upper[held] = np.minimum(upper[held], start[held] + HELD_WIDTH)
     return lower, upper
+
+
+def _stop_of(validator: MotionValidator) -> Callable[[], bool]:
+    """Return a function that asks a motion validator whether motions are to be invalid, without owning it."""
+    known = ref(validator)
+
+    def stop() -> bool:
+        one = known()
+        return one is not None and one.stop()
+
+    return stop
+
+
+def _resting(constraints: ConstraintSet, start: Array, goals: Array, held: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return the joints that stay: those that are held, and those out of reach of projection that no goal moves."""
+    alike = [k for k in constraints.fixed if (goals[:, k] == start[k]).all()]
+    return np.union1d(held, np.array(alike, np.intp))
 
 
 def _held_fault(robot: Robot, start: Array, goal: Array, held: NDArray[np.intp]) -> str:

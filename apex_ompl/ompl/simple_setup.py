@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from contextlib import nullcontext
+from typing import TYPE_CHECKING, Any
 
 from ompl import base as ob
 from ompl import geometric as og
 
+from apex_ompl.ompl.constrained_space import constraint_of, projected_space
 from apex_ompl.ompl.process import ends_after
 from apex_ompl.ompl.space import Bounds, await_goal, state_space
 from apex_ompl.robot import Robot
 from apex_ompl.util.process import running
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 
 class SpaceInformation(ob.SpaceInformation):
@@ -31,22 +36,51 @@ class SpaceInformation(ob.SpaceInformation):
         super().setStateValidityChecker(_of_truth(svc))
 
 
+class ConstrainedSpaceInformation(ob.ConstrainedSpaceInformation):
+    """As :class:`SpaceInformation`, of a state space under constraints along the path.
+
+    Attributes:
+        robot: The robot.
+        constraint: The constraints, as the state space has them.
+    """
+
+    def __init__(self, space: ob.ProjectedStateSpace, robot: Robot) -> None:
+        """Describe a space of a robot, see :func:`apex_ompl.ompl.constrained_space.projected_space`."""
+        super().__init__(space)
+        self.robot, self.constraint = robot, constraint_of(space)
+
+    def setStateValidityChecker(self, svc: ob.StateValidityChecker | Callable[[Any], Any]) -> None:  # noqa: N802 - OMPL's name
+        """Set the checker that decides from now on; a function may return anything that is true or false."""
+        super().setStateValidityChecker(_of_truth(svc))
+
+
+RobotSpaceInformation = SpaceInformation | ConstrainedSpaceInformation
+
+
 class SimpleSetup(og.SimpleSetup):
-    """OMPL's SimpleSetup in the state space of a robot.
+    """OMPL's SimpleSetup in the state space of a robot, under constraints along the path where there are some.
 
     Beyond OMPL's own, checkers may return ``numpy.bool_``; ``solve`` lets goals be sampled by Python in another thread;
     ``getPlannerData`` knows this package's planners; and a daemon thread inside of ``solve`` when the interpreter ends
     is ended in order.
     """
 
-    def __init__(self, robot: Robot, bounds: Bounds | None = None) -> None:
+    def __init__(self, robot: Robot, bounds: Bounds | None = None, constraints: ConstraintSet | None = None) -> None:
         """Make a setup without checker, start and goal.
 
         Args:
             robot: The robot.
             bounds: Bounds of the state space, by default the robot's limits.
+            constraints: Constraints along the path, or None for none.
+
+        Raises:
+            ConstraintError: They leave no joint free.
         """
-        super().__init__(SpaceInformation(state_space(robot, bounds=bounds), robot))
+        space = state_space(robot, bounds=bounds)
+        if constraints is None:
+            super().__init__(SpaceInformation(space, robot))
+        else:
+            super().__init__(ConstrainedSpaceInformation(projected_space(space, constraints), robot))
 
     def setStateValidityChecker(self, svc: ob.StateValidityChecker | Callable[[Any], Any]) -> None:  # noqa: N802 - OMPL's name
         """Set the checker that decides from now on; a function may return anything that is true or false."""
@@ -56,7 +90,9 @@ class SimpleSetup(og.SimpleSetup):
         """Solve within a time [s], or until a condition holds."""
         given = time if ptc is None else ptc
         ptc = given if isinstance(given, ob.PlannerTerminationCondition) else ends_after(given)
-        with running(ptc.terminate):
+        constraint = constraint_of(self.getStateSpace())
+        ending = nullcontext() if constraint is None else constraint.ends_on_fault(ptc)
+        with running(ptc.terminate), ending:
             self.setup()  # sampling begins after it
             await_goal(self.getGoal(), ptc)
             return super().solve(ptc)

@@ -49,6 +49,11 @@ def state_space(
     return space
 
 
+def ambient_space(space: ob.StateSpace) -> ob.StateSpace:
+    """Return the space that a constrained state space is a part of, or the given one where it is not constrained."""
+    return space.getSpace() if isinstance(space, ob.ConstrainedStateSpace) else space
+
+
 def require_real_vectors(space: ob.StateSpace) -> None:
     """Refuse spaces whose states are no vectors, or lie on a manifold that straight lines leave.
 
@@ -57,18 +62,31 @@ def require_real_vectors(space: ob.StateSpace) -> None:
     """
     if not isinstance(space, ob.RealVectorStateSpace):
         expected = "an ob.RealVectorStateSpace, as apex_ompl.ompl.space.state_space makes it"
+        if isinstance(space, ob.ConstrainedStateSpace):
+            expected += ", since the planner knows no constraints along the path"
         raise ParameterError("state space", type(space).__name__, expected)
 
 
 def bounds_of(si: ob.SpaceInformation, robot: Robot) -> Bounds:
     """Return the bounds of a state space inside of the robot's limits."""
-    box = si.getStateSpace().getBounds()
+    box = ambient_space(si.getStateSpace()).getBounds()
     return np.maximum(robot.limits.lower, box.low), np.minimum(robot.limits.upper, box.high)
 
 
 def to_array(state: Any, dof: int) -> Array:
     """Return an OMPL state as an array, shape (dof,)."""
+    if isinstance(state, ob.ConstrainedStateSpaceStateType):  # which has no slices
+        return np.array([state[k] for k in range(dof)])
     return np.array(state[0:dof])
+
+
+def set_values(state: Any, q: Array) -> None:
+    """Set the values of an OMPL state to those of ``q``, shape (dof,)."""
+    values = [float(v) for v in q]
+    if isinstance(state, ob.ConstrainedStateSpaceStateType):
+        state.copy(values)
+    else:
+        state[0 : len(values)] = values
 
 
 def new_state(si: ob.SpaceInformation) -> Any:
@@ -94,13 +112,13 @@ def _users_of_new() -> int:
 def to_state(si: ob.SpaceInformation, q: Array) -> Any:
     """Return a new OMPL state with the values of ``q``, shape (dof,), which is freed when Python drops it."""
     state = new_state(si)
-    state[0 : len(q)] = [float(v) for v in q]
+    set_values(state, q)
     return state
 
 
 def path_to_array(path: og.PathGeometric, dof: int) -> Array:
     """Return the states of an OMPL path, shape (N, dof)."""
-    return np.array([path.getState(k)[0:dof] for k in range(path.getStateCount())]).reshape(-1, dof)
+    return np.array([to_array(path.getState(k), dof) for k in range(path.getStateCount())]).reshape(-1, dof)
 
 
 def array_to_path(si: ob.SpaceInformation, states: Array) -> og.PathGeometric:
@@ -108,7 +126,7 @@ def array_to_path(si: ob.SpaceInformation, states: Array) -> og.PathGeometric:
     path = og.PathGeometric(si)
     state = new_state(si)
     for q in states:
-        state[0 : len(q)] = [float(v) for v in q]
+        set_values(state, q)
         path.append(state)  # a copy
     return path
 
@@ -122,8 +140,9 @@ def motions_free(si: ob.SpaceInformation, first: Array, last: Array) -> Flags:
         last: Last states, shape (N, dof).
     """
     a, b, found = new_state(si), new_state(si), []
-    for p, q in zip(first.tolist(), last.tolist(), strict=True):
-        a[0 : len(p)], b[0 : len(q)] = p, q
+    for p, q in zip(first, last, strict=True):
+        set_values(a, p)
+        set_values(b, q)
         found.append(bool(si.checkMotion(a, b)))
     return np.array(found, bool)
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 import numpy as np
@@ -15,14 +15,19 @@ from ompl import base as ob
 
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.path_proof import Curve, PathProof
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.proof import ConstraintCertificate, prove_motion, prove_path
-from apex_ompl.ompl.simple_setup import SpaceInformation
+from apex_ompl.ompl.simple_setup import RobotSpaceInformation
+from apex_ompl.ompl.space import to_array, to_state
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.timing.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_states, number_array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.proof import ConstraintCertificate
+
+JUMP = 2.0  # largest distance of neighboring states of a motion on constraints, in units of that on the straight line
 
 
 class MotionCheck:
@@ -50,6 +55,48 @@ class MotionProof:
         return bool(self.checker.prove(np.array([a, b]), tolerance=0.0))
 
 
+class ConstrainedMotionCheck(MotionCheck):
+    """Check of motions along the projection of straight lines onto constraints; a plain callable, without OMPL."""
+
+    def __init__(
+        self, checker: CollisionChecker, constraints: ConstraintSet, resolution: float = SEARCH_RESOLUTION
+    ) -> None:
+        """Check by ``checker`` at states of the manifold that are about ``resolution`` apart [rad, max-norm]."""
+        super().__init__(checker, resolution)
+        self.constraints = constraints
+
+    def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
+        """Whether the motion from ``a`` to ``b`` stays on the manifold and is free; ``a`` is taken to be free."""
+        states = self.states(np.asarray(a, float), np.asarray(b, float))
+        return states is not None and self.checker.first_collision(states, self.resolution, start=False) is None
+
+    def states(self, a: Array, b: Array) -> Array | None:
+        """Return states of the motion, shape (N, dof), or None where the projections do not lead from ``a`` to ``b``.
+
+        Their neighbors are at most ``JUMP`` times as far apart as those on the straight line.
+        """
+        count = max(1, int(np.ceil(np.abs(b - a).max() / self.resolution)))
+        states = a + np.linspace(0.0, 1.0, count + 1)[:, None] * (b - a)
+        states[-1] = b
+        if count > 1:
+            for few in (slice(count // 2, count // 2 + 1), slice(1, count)):  # most that fail do so in the middle
+                found = self.constraints.project(states[few])
+                if not found.ok.all():
+                    return None
+            states[1:-1] = found.states
+        return states if np.abs(np.diff(states, axis=0)).max() <= JUMP * np.abs(b - a).max() / count else None
+
+    def along(self, nodes: Array) -> Array | None:
+        """Return the states of the motions between nodes, shape (N, dof), or None where one is no motion."""
+        pieces = [nodes[:1]]
+        for a, b in zip(nodes, nodes[1:], strict=False):
+            states = self.states(a, b)
+            if states is None:
+                return None
+            pieces.append(states[1:])
+        return np.concatenate(pieces)
+
+
 class StateValidityChecker(ob.StateValidityChecker):
     """OMPL state validity checker over a collision checker.
 
@@ -69,7 +116,7 @@ class StateValidityChecker(ob.StateValidityChecker):
     def isValid(self, state: Any) -> bool:  # noqa: N802 - OMPL's name
         """Whether the state is free."""
         try:
-            q = np.array(state[0 : self.dof])
+            q = to_array(state, self.dof)
             return (self.constraints is None or self.constraints.is_satisfied(q)) and self.checker.is_free(q)
         except BaseException as error:
             state = None
@@ -79,7 +126,7 @@ class StateValidityChecker(ob.StateValidityChecker):
     def clearance(self, state: Any) -> float:
         """Return the least distance of all checked pairs at the state [m], 0 after a fault."""
         try:
-            return self.checker.clearance(np.array(state[0 : self.dof]))
+            return self.checker.clearance(to_array(state, self.dof))
         except BaseException as error:
             state = None
             self.fault = self.fault or error
@@ -103,7 +150,7 @@ class MotionValidator(ob.MotionValidator):
     """
 
     def __init__(
-        self, si: SpaceInformation, check: MotionCheck | MotionProof, validity_checker: StateValidityChecker
+        self, si: RobotSpaceInformation, check: MotionCheck | MotionProof, validity_checker: StateValidityChecker
     ) -> None:
         """Check motions of ``si``, in place of the motion validator that it has."""
         super().__init__(si)
@@ -127,12 +174,22 @@ class MotionValidator(ob.MotionValidator):
             if self.stop():
                 return False
             if self.decides:
-                return self.check(first[0 : self.dof], second[0 : self.dof])
+                return self.check(to_array(first, self.dof), to_array(second, self.dof))
+            between = self._between(first, second) if isinstance(self.check, ConstrainedMotionCheck) else None
         except BaseException as error:
             first = second = None
             self.fault = self.fault or error
             return False
-        return bool(self._discrete.checkMotion(first, second))
+        if between is None:
+            return bool(self._discrete.checkMotion(first, second))
+        si = self._si()
+        return si is not None and len(between) > 0 and all(si.isValid(to_state(si, q)) for q in between[::-1])
+
+    def _between(self, first: Any, second: Any) -> Array:
+        """Return the states of a motion on the manifold after the first, shape (N, dof), none where it is none."""
+        assert isinstance(self.check, ConstrainedMotionCheck)
+        states = self.check.states(to_array(first, self.dof), to_array(second, self.dof))
+        return np.empty((0, self.dof)) if states is None else states[1:]
 
 
 class _Forwarding(ob.MotionValidator):
@@ -254,6 +311,8 @@ def full_check(
         return FullCheck(False, "not proved in time", None, timed_out=True)
     kept: ConstraintCertificate | None = None
     if constraints is not None:
+        from apex_ompl.constraints.proof import prove_motion, prove_path
+
         kept = prove_path(constraints, states) if motion is None else prove_motion(constraints, motion)
         if not kept:
             return FullCheck(False, kept.fault, None, constraints=kept)

@@ -438,20 +438,28 @@ class MotionPlanner:
             checker = self._checker_now()
             return StateCheck(state_fault(checker, q), checker.clearance(q), tuple(checker.contacts(q)))
 
-    def simple_setup(self, start: State, goal: Target) -> og.SimpleSetup:
+    def simple_setup(
+        self, start: State, goal: Target, *, constraints: Sequence[Constraint | UserConstraint] = ()
+    ) -> og.SimpleSetup:
         """Return OMPL's SimpleSetup in the world as it is now, for planners and tools of OMPL's own.
 
         Edits of the world change what its checkers say, unless an obstacle is yet to appear: that one is left out.
 
+        Args:
+            start: The start.
+            goal: The goal.
+            constraints: Constraints along the path; with any, the space is OMPL's projected one, whose planners return
+                states on the constraints that are joined by projections of straight lines.
+
         Raises:
-            ApexError: The start or the goal is faulty.
+            ApexError: The start, the goal or a constraint is faulty.
         """
         from apex_ompl.apex.parameters import NAME
         from apex_ompl.ompl.setup import assemble
 
         with self._lock:
             checker = self._checker_without(self._absent(), kept=False)
-            ready = assemble(self.problem(start, goal), self.robot, checker=checker)
+            ready = assemble(self.problem(start, goal), self.robot, checker=checker, constraints=constraints)
         ready.simple_setup.setPlannerAllocator(planners.allocator(NAME))
         return ready.simple_setup
 

@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import nan
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from ompl import base as ob
@@ -28,14 +28,12 @@ from apex_ompl import planners
 from apex_ompl.apex.parameters import NAME, ApexParameters
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.proof import ConstraintCertificate, prove_motion
-from apex_ompl.constraints.user import UserConstraint
-from apex_ompl.errors import ApexError, TimingError, TimingStoppedError
+from apex_ompl.errors import ApexError, ParameterError, TimingError, TimingStoppedError
 from apex_ompl.ompl import setup as ompl_setup
+from apex_ompl.ompl.constrained_space import CONSTRAINED, ManifoldLength
 from apex_ompl.ompl.own_planner import SolveReport, reporting
 from apex_ompl.ompl.process import MAX_TIME, Interrupt, ends_after, quiet_ompl, seed_ompl
-from apex_ompl.ompl.repair import repair
+from apex_ompl.ompl.repair import exact_paths, repair
 from apex_ompl.ompl.repair import simplify as shorten
 from apex_ompl.ompl.setup import PlanningSetup, set_goals
 from apex_ompl.ompl.space import path_to_array
@@ -59,6 +57,11 @@ from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.display import one_line
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.validation import check_positive
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.proof import ConstraintCertificate
+    from apex_ompl.constraints.user import UserConstraint
 
 STRAIGHT_LINE = "straight line"
 UNNAMED = "unnamed"  # planner of a user's function before it is made
@@ -256,6 +259,8 @@ def check(
     improves_motion &= isinstance(parameters, ApexParameters) and parameters.anytime
     if improves_motion:
         parameters = parameters.changed(anytime=False)
+    if setup.constraints is not None and not parameters.constrained:
+        raise ParameterError("planner", parameters.name, CONSTRAINED)
     status, reason, nearest = query_fault(setup)
     name, spent = parameters.name or UNNAMED, dict(times or {})
     return PlanQuery(
@@ -475,7 +480,8 @@ def _set_up(query: PlanQuery) -> ob.Planner:
         set_goals(simple_setup, [nearest])
         query.notes.append(f"{query.planner} runs threads and takes one goal: the nearest of {len(goals)}")
     if parameters.optimizing:  # others would go on after their first solution, prm for one
-        simple_setup.setOptimizationObjective(ob.PathLengthOptimizationObjective(si))
+        length = ob.PathLengthOptimizationObjective if setup.constraints is None else ManifoldLength
+        simple_setup.setOptimizationObjective(length(si))
     planner = parameters.build(si)
     query.planner = parameters.name or planner.getName()
     simple_setup.setPlanner(planner)
@@ -494,6 +500,12 @@ def _verified(found: FoundPath, path: Path, simplify: bool) -> ProvedPath:
     """Return the first of the shortened path and the path itself that passes the full check, or can be repaired."""
     query, solved_by, setup, reason, late = found.query, found.solved_by, found.query.setup, "", False
     candidates = [with_exact_ends(setup, path)]
+    if setup.constraints is not None and not query.parameters.smooth:
+        nodes, rng = candidates[0].states, np.random.default_rng(setup.seed) if simplify else None
+        with timed(query.times, "simplify"):
+            exact = exact_paths(setup.checker, setup.constraints, nodes, rng=rng, stop=query.ends_search)
+        candidates = [Path(states) for states in exact]
+        reason = "" if candidates else "its states cannot be joined on the constraints"
     shortens = simplify and setup.constraints is None and not query.parameters.smooth
     if shortens and path.spline is None and not query.ends_search():
         with timed(query.times, "simplify"):
@@ -587,6 +599,8 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         result = replace(result, path=better.path, **certificate(better.path_proof))
     assert made is not None
     if setup.constraints is not None:
+        from apex_ompl.constraints.proof import prove_motion
+
         kept = prove_motion(setup.constraints, made.trajectory)
         result = replace(result, **_constraint_fields(setup.constraints, kept))
     use = made.trajectory.use(limits) | ({} if more is None else more.use(made.trajectory))

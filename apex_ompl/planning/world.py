@@ -221,7 +221,7 @@ class World:
 
     def attach(
         self, held: AttachedObject | Mapping[str, Any] | str, link: str | None = None,
-        touch_links: Sequence[str] | None = None, *, at: ArrayLike | None = None,
+        touch_links: Sequence[str] | None = None, *, links: Sequence[str] | None = None, at: ArrayLike | None = None,
     ) -> None:  # fmt: skip
         """Attach an object to a link; it then collides like a part of the robot.
 
@@ -230,6 +230,8 @@ class World:
                 where it stands.
             link: Link that holds it; must be given for an obstacle.
             touch_links: Links that it may touch; by default those of the hand.
+            links: Two links that hold it together, in place of ``link``: the second keeps its pose in the first along
+                every path.
             at: State at which it is taken, shape (dof,); must be given for an obstacle. The object must not overlap
                 anything there.
 
@@ -240,6 +242,10 @@ class World:
         """
         with self.lock:
             taken = None
+            if links is not None:
+                if link is not None:
+                    raise SceneError("give either one link or links, not both")
+                link = next(iter(links), None)
             if isinstance(held, str):
                 if link is None or at is None:
                     raise SceneError(
@@ -249,7 +255,7 @@ class World:
                 held = self._as_held(taken, link, finite_array(at, "at"))
             wanted = self._read(AttachedObject, held, "held object")
             wanted = with_file_unread(wanted) if taken is None else wanted
-            changes = {"link": link, "touch_links": touch_links}
+            changes = {"link": link, "links": links, "touch_links": touch_links}
             if given := {key: value for key, value in changes.items() if value is not None}:
                 wanted = validate(AttachedObject, given_fields(wanted) | given, "held object")
             wanted = with_file_read(wanted)
@@ -279,7 +285,7 @@ class World:
             held, left = self.held.get(name) if isinstance(name, str) else None, list[Obstacle]()
             if at is not None and held is not None:
                 pose = self.checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
-                shape = given_fields(held, ("link", "touch_links", "contact"))
+                shape = given_fields(held, ("link", "links", "touch_links", "contact"))
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
             self.checker.detach(name)
             self._add(left)

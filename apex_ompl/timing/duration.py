@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.constraints import ConstraintRows, lower_constrained_duration
 from apex_ompl.kernel.duration import DurationReport, DurationSettings, TimeGrid, lower_duration
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.paths.path import resample
@@ -26,6 +26,9 @@ from apex_ompl.timing.spline_method import least_knot_spacing
 from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline, basis
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.validation import check_name, check_number, check_states
+
+if TYPE_CHECKING:
+    from apex_ompl.kernel.constraints import ConstraintRows
 
 OBJECTIVES = ("time", "length", "calm")
 """What a plan is to be: fast, short, or calm, which is the least integral of the squared jerk in some more time."""
@@ -229,6 +232,8 @@ class DurationOptimizer:
         if self._constraints is None:
             report = lower_duration(self.kernel, grid, self._limits, PINNED, control, spacing, settings)
         else:
+            from apex_ompl.kernel.constraints import lower_constrained_duration
+
             report = lower_constrained_duration(
                 self.kernel, self._constraints, grid, self._limits, PINNED, control, spacing, settings, level.penalty
             )

@@ -40,11 +40,17 @@ class Opposed(ob.Constraint):
         out[0] = x[0] - x[7]
 
 
-@pytest.mark.parametrize("name", ["apex", "drrt"])
-def test_a_space_that_is_no_vector_space_is_refused(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("apex", "constraint of the state space: expected .*ManifoldConstraint, got 'Opposed'"),
+        ("drrt", "state space: expected an ob.RealVectorStateSpace.*'ProjectedStateSpace'"),
+    ],
+)
+def test_a_space_that_is_no_vector_space_is_refused(name: str, expected: str) -> None:
     si = ob.ConstrainedSpaceInformation(ob.ProjectedStateSpace(state_space(robot()), Opposed()))
     si.setStateValidityChecker(lambda state: True)
-    with pytest.raises(ParameterError, match="state space: expected an ob.RealVectorStateSpace.*'ProjectedStateSpace'"):
+    with pytest.raises(ParameterError, match=expected):
         planners.make(name, si)
 
 

@@ -9,14 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import count
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from apex_ompl.apex.context import SolveContext
 from apex_ompl.apex.stages.stage import Solution
-from apex_ompl.constraints.paths import ConstrainedPaths
 from apex_ompl.paths.path import Path, path_length
 from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.paths import ConstrainedPaths
 
 LINE, TREES, PROPOSED = "line+projection", "trees on constraints", "apex+projection"
 DRAWS = 40  # of shortcuts along a path of trees

@@ -239,6 +239,17 @@ CONSTRAINED = Group(
                 ROBOT + SCENE + WORKSPACE + TREES + PROOF + ", " + ROBOT + "i8, i8, i8[::1], f8[::1], f8[:, ::1]",
                 8,
             ),
+            "constraint.search.connect_states": (
+                ROBOT
+                + SCENE
+                + WORKSPACE
+                + "f8[::1], f8, f8, f8[::1], f8[:, ::1], "
+                + PROOF
+                + ", "
+                + ROBOT
+                + "i8, i8, i8[::1], f8[::1], f8[:, ::1]",
+                4,
+            ),
         },
         {
             "constraint.duration.lower_constrained_duration": (

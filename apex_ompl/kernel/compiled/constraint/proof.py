@@ -61,6 +61,7 @@ from apex_ompl.kernel.compiled.robot.kinematics import place_joints
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 PROVED, VIOLATED, UNDECIDED, INVALID = range(4)  # outcomes
+TIGHT = 0.25  # share of a tolerance by which bounds may exceed |r|, while intervals are few
 ROUNDING = 1e-12  # of states and residuals, for frames within some 100 m
 DEEPEST = 40  # bisections of a piece
 INTERVALS, MORE_INTERVALS = 20_000, 100  # most intervals: so many, and so many for each piece
@@ -303,16 +304,19 @@ def _set_interval(middle: float, half: float, p: ConstraintProofBuffers) -> None
 
 @inlined
 def _examine(
-    t: RobotArrays, w: Workspace, c: ConstraintArrays, p: ConstraintProofBuffers, b: RowBuffers
+    t: RobotArrays, w: Workspace, c: ConstraintArrays, p: ConstraintProofBuffers, b: RowBuffers, tight: bool
 ) -> tuple[int, int, float]:
-    """Return outcome, failing group and its |r| for the interval that is set; UNDECIDED where it is to be bisected."""
+    """Return outcome, failing group and its |r| for the interval that is set; UNDECIDED where it is to be bisected.
+
+    Where it is to be ``tight``, a bound is at most a share TIGHT of the tolerance above |r| in the middle.
+    """
     place_joints(t, w, p.state, c.chain, 0, len(c.chain))
     for g in range(len(c.kind)):
         size, bound = bound_group(t, w, c, g, p, b)
         p.violations[g] = max(p.violations[g], size)
         if not size <= c.tolerance[g]:
             return VIOLATED, g, size
-        if not bound <= c.tolerance[g]:
+        if not bound <= (min(c.tolerance[g], size + TIGHT * c.tolerance[g]) if tight else c.tolerance[g]):
             return UNDECIDED, g, size
         p.found[g] = bound
     for g in range(len(c.kind)):
@@ -371,7 +375,7 @@ def prove_constraints(
             middle = 0.5 * (start + end)
             _set_interval(middle, 0.5 * (end - start), p)
             p.counts[0] += 1
-            outcome, g, size = _examine(t, w, c, p, b)
+            outcome, g, size = _examine(t, w, c, p, b, 2 * p.counts[0] < most)
             if outcome == PROVED:
                 continue
             last = top + 2 > len(p.stack) or p.counts[0] >= most
