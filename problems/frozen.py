@@ -15,15 +15,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
+from apex_ompl.paths.path import states_between
 from apex_ompl.problems.broad_representation import Group, given
-from apex_ompl.problems.catalogue import LEVELS, SPLITS, VALIDATION, ProblemId
+from apex_ompl.problems.catalogue import CONSTRAINED, LEVELS, SPLITS, VALIDATION, ProblemId
 from apex_ompl.problems.objects import DATA
 from apex_ompl.problems.suite_robot import ROBOT, robot
 from apex_ompl.scene.bodies import Obstacle, located
@@ -37,16 +40,22 @@ FOLDER = Path(__file__).parent / "frozen"
 SUMS = "SHA256SUMS"
 SCHEMA = "apex-ompl/frozen/1"
 COUNTS = {
-    "validation": {"static": 30, "extreme": 20, "moving": 10, "unseen": 50},
-    "test": {"static": 100, "extreme": 30, "moving": 20, "unseen": 0},
+    "validation": {"static": 30, "extreme": 20, "moving": 10, "unseen": 50, "constrained": 0, "unseen constrained": 75},
+    "test": {"static": 100, "extreme": 30, "moving": 20, "unseen": 0, "constrained": 17, "unseen constrained": 0},
 }  # problems of a level of each kind
-FROZEN = {**LEVELS, **VALIDATION}
+FROZEN = {
+    suite: (*levels, *CONSTRAINED.get(suite, ())) for suite, levels in {**LEVELS, **VALIDATION}.items()
+}  # fmt: skip
+BETWEEN = 0.01  # spacing of the states of a witness under constraints, between those that are stored [rad, max-norm]
 STATE_STEP, TIME_STEP = 1e-4, 1e-3  # quantization of the states of witnesses [rad] and of their times [s]
 
 
 @dataclass(frozen=True, eq=False)
 class Witness:
     """A proof that a problem can be solved.
+
+    Under constraints its states, and those of the straight lines between them, are moved onto the constraints, see
+    :func:`on_constraints`.
 
     Attributes:
         path: States from start to goal, shape (N, dof).
@@ -93,17 +102,39 @@ class FrozenProblem:
         return digest(self.problem)
 
 
+def on_constraints(problem: Problem, path: Array) -> Array | None:
+    """Return the states of a witness, and further ones between them, moved onto the constraints of its problem.
+
+    Args:
+        problem: The problem.
+        path: States of the witness, shape (N, dof).
+
+    Returns:
+        Shape (M, dof), ``BETWEEN`` apart before they are moved, the ends as they are; None where one cannot be moved.
+    """
+    constraints = ConstraintSet.of(robot(), problem.constraints, problem.attached, path[0])
+    rows = [path[:1], *(np.concatenate([states_between(a, b, BETWEEN), b[None]]) for a, b in pairwise(path))]
+    states = np.concatenate(rows)
+    moved, arrived = constraints.project(states[1:-1])
+    return np.concatenate([path[:1], moved, path[-1:]]) if arrived.all() else None
+
+
 def is_frozen(problem_id: ProblemId) -> bool:
-    """Whether a problem is among the frozen ones."""
+    """Whether a problem is among the frozen ones; levels with constraints are drawn until they have a file."""
     seeds = (frozen_seeds(problem_id.suite, problem_id.level, split) for split in COUNTS)
-    known = problem_id.level in FROZEN.get(problem_id.suite, ())
-    return known and any(problem_id.seed in some for some in seeds)
+    suite, level = problem_id.suite, problem_id.level
+    if level not in FROZEN.get(suite, ()) or (level in CONSTRAINED.get(suite, ()) and not exists(suite, level)):
+        return False
+    return any(problem_id.seed in some for some in seeds)
 
 
 def frozen_seeds(suite: str, level: str, split: str) -> range:
     """Return the seeds of the frozen problems of a suite and level in a split."""
     kind = "extreme" if level == "extreme" else "moving" if level.startswith("moving-") else "static"
-    kind = "unseen" if suite in VALIDATION else kind
+    if level in CONSTRAINED.get(suite, ()):
+        kind = "unseen constrained" if suite in VALIDATION else "constrained"
+    elif suite in VALIDATION:
+        kind = "unseen"
     first = SPLITS[split].start
     return range(first, first + COUNTS[split][kind])
 
@@ -125,6 +156,7 @@ def load(problem_id: ProblemId) -> FrozenProblem:
         fields = {
             "schema": "apex-ompl/problem/1", "name": str(problem_id), "robot": head["robot"], "scene": row["scene"],
             "attached": head["held"][row["held"]], "start": start, "goal": {"joints": goal},
+            "constraints": head.get("constraints", ()),
         }  # fmt: skip
         inner = np.array(row["path"], float).reshape(-1, len(joints)) * STATE_STEP
         states = np.concatenate([[row["start"]], inner, [row["goal"]]])
@@ -177,9 +209,10 @@ def save(suite: str, level: str, frozen: Mapping[int, FrozenProblem], dropped: i
         raise ParameterError("replace", replace, f"True, since {_name(suite, level)} exists")
     joints = robot().joint_names
     held: list[Any] = []
-    rows = []
+    rows, constraints = [], list[Any]()
     for seed, item in sorted(frozen.items()):
         data = item.problem.as_dict()
+        constraints = data.get("constraints", [])  # the same of all problems of a level
         attached = [_with_mesh_name(body) for body in data.get("attached", [])]
         if attached not in held:
             held.append(attached)
@@ -194,7 +227,10 @@ def save(suite: str, level: str, frozen: Mapping[int, FrozenProblem], dropped: i
         if item.witness.times is not None:
             row["times"] = _quantized(item.witness.times, TIME_STEP).tolist()
         rows.append(row)
-    head = {"schema": SCHEMA, "suite": suite, "level": level, "robot": ROBOT, "joints": list(joints)}
+    head: dict[str, Any] = {
+        "schema": SCHEMA, "suite": suite, "level": level, "robot": ROBOT, "joints": list(joints),
+    }  # fmt: skip
+    head |= {"constraints": constraints} if constraints else {}
     text = json.dumps({**head, "dropped": dropped, "held": held, "problems": rows}, separators=(",", ":"))
     content = lzma.compress(text.encode(), preset=9 | lzma.PRESET_EXTREME)
     FOLDER.mkdir(exist_ok=True)

@@ -7,6 +7,8 @@ them, and missing ones are added; --replace draws all again.
 Witnesses among static obstacles are found by rrtconnect, and on ``extreme`` by apex, or else by rrtconnect
 with a range of 0.7 rad, each in eight seconds. There they keep half a millimeter of clearance: obstacles are a
 millimeter larger on each side for the planner, and the robot's own distances are looked up along its path.
+Under constraints they are found by the trees of apex, in two seconds or five; their states are thinned out, as those
+between are moved onto the constraints again.
 On ``unseen`` apex, and else rrtconnect with its tuned range, each have ten seconds.
 
 Usage: python scripts/freeze_problems.py [--replace] [--jobs 2] [SUITE/LEVEL ...]
@@ -49,6 +51,8 @@ FINDERS = (("apex", {}), ("rrtconnect", {"range": 0.7}))  # of witnesses on the 
 EXTREME_LIMIT = 8.0  # of each of them [s]
 UNSEEN_FINDERS = (("apex", {}), ("rrtconnect", TUNED["rrtconnect"]))  # of witnesses of the suite unseen
 UNSEEN_LIMIT = 10.0  # of each of them [s]
+CONSTRAINED_LIMITS = ((0, 2.0), (1, 5.0))  # seeds and time limits of trees under constraints [s]
+TREES = {"model": "none", "first": 0, "second": 0, "third": 0, "resample": 0, "line": False, "polish": False}
 STRIDES = (16, 8, 4, 2, 1)  # a witness on extreme or unseen is every k-th state of a path, for the first k that will do
 SCENE_GAP, OWN_GAP = 1e-3, 5e-4  # clearance of witnesses of extreme to obstacles, and of all other pairs [m]
 GAP_SPACING = 0.03  # of the states at which the robot's own clearance is looked up [rad]
@@ -62,9 +66,33 @@ def witness(problem: Problem) -> Witness | None:
     """Return a witness for a problem, or None when none was found."""
     if problem.moving:
         return _timed_witness(problem)
+    if is_constrained(problem):
+        return _constrained_witness(problem)
     if problem.name.partition("/")[0] in VALIDATION:
         return _found_by(UNSEEN_FINDERS, problem, UNSEEN_LIMIT)
     return _extreme_witness(problem) if "/extreme/" in problem.name else _static_witness(problem)
+
+
+def is_constrained(problem: Problem) -> bool:
+    """Whether a problem of a suite has constraints, or an object in two hands."""
+    return bool(problem.constraints) or any(body.links for body in problem.attached)
+
+
+def _constrained_witness(problem: Problem) -> Witness | None:
+    ready = assemble(problem)
+    for seed, timeout in CONSTRAINED_LIMITS:
+        result = plan(problem, timeout=timeout, seed=seed, params=TREES, timing=False)
+        if not result or result.path is None:
+            continue
+        for stride in STRIDES:
+            states = result.path.states
+            found = Witness(np.concatenate([states[:-1:stride], states[-1:]])).rounded()
+            path = frozen.on_constraints(problem, found.path)
+            if path is not None and full_check(
+                ready.checker, path, ready.start, ready.goals, constraints=ready.constraints
+            ):
+                return found
+    return None
 
 
 def _static_witness(problem: Problem) -> Witness | None:

@@ -15,14 +15,16 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.constraints.frames import frame_of
+from apex_ompl.evaluation.rows import Job
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length, states_between
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import pose_matrix
-from apex_ompl.scene.constraints import WORLD, FixedOrientation, OnLine, OnPlane, RelativePose, Upright
+from apex_ompl.scene.constraints import WORLD, FixedOrientation, OnLine, OnPlane, RelativePose, ToolRegion, Upright
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
@@ -30,6 +32,8 @@ from apex_ompl.util.clocks import timed
 DENSE = SEARCH_RESOLUTION / 20.0  # spacing of the states of the check [rad, max-norm]
 REFINED = 0.01  # of those of a rival's path after refinement [rad, max-norm]
 SLACK = 1e-9  # by which a violation may pass its tolerance, for rounding [m, rad]
+
+WARM_UP = "carry_tray"  # problem of the runs that load code
 
 Residual = Callable[[Mapping[str, Array]], float]
 """Distance or angle from what is wanted, over its tolerance, by the poses of frames."""
@@ -89,6 +93,22 @@ def _unit(vector: Any) -> Array:
     return np.asarray(vector, float) / np.linalg.norm(vector)
 
 
+def _region(constraint: ToolRegion) -> Residual:
+    origin = pose_matrix(constraint.position, constraint.orientation)
+
+    def worst(poses: Mapping[str, Array]) -> float:
+        found = np.linalg.inv(origin) @ poses[constraint.frame]
+        off = 0.0 if constraint.angle is None else _turned(np.eye(4), found) / constraint.angle
+        for value, low, high in zip(found[:3, 3], constraint.lower, constraint.upper, strict=True):
+            if low is not None and high is not None:
+                off = max(off, abs(value - (low + high) / 2.0) / ((high - low) / 2.0))
+            elif (low is not None and value < low) or (high is not None and value > high):
+                off = np.inf
+        return float(off)
+
+    return worst
+
+
 def frames_of(constraint: Any) -> tuple[str, ...]:
     """Return the names of the frames of a constraint but for the world."""
     names = (constraint.first, constraint.second) if isinstance(constraint, RelativePose) else (constraint.frame,)
@@ -126,6 +146,8 @@ def residual_of(constraint: Any, start: Mapping[str, Array]) -> Residual:
         if constraint.orientation is not None:
             wanted = pose_matrix((0.0, 0.0, 0.0), constraint.orientation)
         return lambda p: _turned(wanted, p[constraint.frame]) / constraint.angle
+    if isinstance(constraint, ToolRegion):
+        return _region(constraint)
     raise NotImplementedError(f"no dense check of {type(constraint).__name__}")
 
 
@@ -148,6 +170,11 @@ def _relative(constraint: RelativePose, start: Mapping[str, Array]) -> Residual:
         return max(off, _turned(wanted, found) / tolerance.angle)
 
     return worst
+
+
+def problem_of(job: Job) -> Problem:
+    """Return the problem of a run; that of a run to warm up has constraints, too."""
+    return load_problem(WARM_UP if job.experiment == "warm-up" else job.problem)
 
 
 def arm_joints(ready: PlanningSetup) -> Array:
@@ -184,7 +211,7 @@ def dense_check(robot: Robot, problem: Problem, path: Array, spacing: float = DE
     worst = 0.0
     for q in states:
         poses = reader(q, names)
-        worst = max(worst, *(residual(poses) for residual in residuals))
+        worst = max([worst, *(residual(poses) for residual in residuals)])
     checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
     return DenseCheck(len(states), worst, bool(checker.are_free(states).all()))
 

@@ -18,7 +18,6 @@ import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
-from apex_ompl.api import load_problem
 from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.errors import ParameterError
 from apex_ompl.evaluation.rows import Job
@@ -27,7 +26,7 @@ from apex_ompl.kernel.constraints import ConstraintRows
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
-from benchmarks.planners.constrained_check import arm_joints, columns
+from benchmarks.planners.constrained_check import arm_joints, columns, problem_of
 
 RUNNER = f"{__name__}:plan_with_ompl"
 PROJECTED, ATLAS, TANGENT_BUNDLE = "projected", "atlas", "tangent_bundle"
@@ -159,7 +158,7 @@ def constrained_space(
 def plan_with_ompl(job: Job) -> Run:
     """Return the columns of a run; the planner of the job is the kind of the space, its parameters are ``Settings``."""
     settings = Settings(**job.params)
-    ready = assemble(load_problem(job.problem), seed=job.seed)
+    ready = assemble(problem_of(job), seed=job.seed)
     constraints = ConstraintSet.of(ready.robot, ready.problem.constraints, ready.problem.attached, ready.start)
     joints = arm_joints(ready)
     made = ProjectedRows if job.planner == PROJECTED and settings.compiled else Rows

@@ -18,7 +18,6 @@ import pinocchio as pin
 from roboplan.core import JointConfiguration
 from roboplan.rrt import RRT, ConstraintProjectorOptions, PoseConstraint, RRTOptions
 
-from apex_ompl.api import load_problem
 from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.constraints.frames import frame_of
 from apex_ompl.errors import ParameterError
@@ -29,7 +28,7 @@ from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.scene.constraints import RelativePose, Upright
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
-from benchmarks.planners.constrained_check import FrameReader, all_constraints, arm_joints, columns
+from benchmarks.planners.constrained_check import FrameReader, all_constraints, arm_joints, columns, problem_of
 from benchmarks.planners.peers import NODES, representable, roboplan_scene
 
 RUNNER = f"{__name__}:plan_with_roboplan"
@@ -108,7 +107,7 @@ def with_frames(urdf: str, frames: Iterable[Box]) -> str:
 
 def plan_with_roboplan(job: Job) -> Run:
     """Return the columns of a run; parameters are those of ``RRTOptions`` and of ``ConstraintProjectorOptions``."""
-    problem = load_problem(job.problem)
+    problem = problem_of(job)
     if not representable(problem):
         return {"solved": False, "status": NO_PROBLEM, "reason": "it has shapes that RoboPlan has not"}
     ready = assemble(problem, seed=job.seed)

@@ -11,14 +11,13 @@ from typing import Any
 import numpy as np
 from sscbirrt import CBiRRT, CBiRRTConfig, FiniteSet, PlanningProblem
 
-from apex_ompl.api import load_problem
 from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
-from benchmarks.planners.constrained_check import arm_joints, columns
+from benchmarks.planners.constrained_check import arm_joints, columns, problem_of
 
 RUNNER = f"{__name__}:plan_with_sscbirrt"
 
@@ -64,7 +63,7 @@ class Arms:
 
 def plan_with_sscbirrt(job: Job) -> Run:
     """Return the columns of a run; parameters of the job are those of ``CBiRRTConfig``."""
-    ready = assemble(load_problem(job.problem), seed=job.seed)
+    ready = assemble(problem_of(job), seed=job.seed)
     constraints = ConstraintSet.of(ready.robot, ready.problem.constraints, ready.problem.attached, ready.start)
     joints = arm_joints(ready)
     arms = Arms(ready, joints)

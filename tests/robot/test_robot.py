@@ -129,8 +129,25 @@ def test_pinocchio_order_is_a_permutation(robot: Robot, baxter: Robot) -> None:
 
 def test_baxter_has_two_arms_and_locked_joints(baxter: Robot) -> None:
     assert baxter.dof == 14 and baxter.model.nq == 14
-    assert robot_names() == ("baxter", "dual_panda_softhand")
+    assert robot_names() == ("baxter", "dual_panda_softhand", "panda")
     assert not any("gripper" in n or "head" in n for n in baxter.joint_names)
+
+
+def test_the_single_panda_has_an_open_gripper_and_frankas_limits() -> None:
+    """Limits and home by Franka's table; at home the gripper points down, 0.1034 m above its tip."""
+    panda = load_robot("panda")
+    gripper = ("panda_hand", "panda_leftfinger", "panda_rightfinger")
+    assert panda.dof == 7 and set(gripper) < set(panda.hand_of("panda_hand"))
+    lower = [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973]
+    upper = [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973]
+    np.testing.assert_allclose([panda.limits.lower, panda.limits.upper], [lower, upper])
+    np.testing.assert_allclose(panda.limits.velocity, [2.175] * 4 + [2.61] * 3)
+    hand, left, right = (panda.link_pose(panda.home, link) for link in gripper)
+    np.testing.assert_allclose(hand[:3, 2], (0.0, 0.0, -1.0), atol=1e-9)
+    assert np.linalg.norm(left[:3, 3] - right[:3, 3]) == pytest.approx(0.08)  # two fingers open by 4 cm each
+    tip = hand @ [*panda.hands["hand"].point, 1.0]
+    assert hand[2, 3] - tip[2] == pytest.approx(0.1034)
+    assert CollisionChecker(panda).is_free(panda.home)
 
 
 def test_a_locked_joint_stands_at_its_value(baxter: Robot, tmp_path: Path) -> None:
