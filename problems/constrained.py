@@ -7,7 +7,8 @@ suite take turns by the seed; their composition stands somewhere, or where the h
 too near to the start or to the goal.
 
 Starts and goals are on the constraint, and free by a margin; of the goal's states on many branches of inverse
-kinematics the nearest one to the start is taken. Of most problems the straight line, moved to the constraint, collides.
+kinematics the nearest one to the start is taken, and trees without obstacles join the two. Of most problems the
+straight line, moved to the constraint, collides.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from apex_ompl.problems.broad import MOST_OBSTACLES, ROUNDING, UNSEEN, compositi
 from apex_ompl.problems.broad_representation import Group, draw_representation, feasible, obstacles
 from apex_ompl.problems.broad_tasks import SHOULDERS, clear_parts, palm_line, scene_of
 from apex_ompl.problems.broad_unseen import STRANGERS
-from apex_ompl.problems.constrained_ends import PalmSampler, line_is_free, palms_at, palms_with_cups
+from apex_ompl.problems.constrained_ends import PalmSampler, are_joined, line_is_free, palms_at, palms_with_cups
 from apex_ompl.problems.constrained_held import CUPS, KINDS, Carried, draw_carried
 from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, robot
 from apex_ompl.scene.bodies import Obstacle
@@ -58,6 +59,8 @@ def draw(rng: np.random.Generator, suite: str, kind: str, seed: int) -> DrawnPro
         found = None if ends is None else _drawn(carried, task.scene, ends)
     else:
         found = _with_tray(rng, carried, suite, kind)
+    if found is not None and kind != CUPS and not are_joined(carried, np.stack([found.start, found.goal])):
+        return None
     if found is None or seed % ANY_LINE == 0:
         return found
     is_free = line_is_free(carried, _tables(found.scene, carried), np.stack([found.start, found.goal]))

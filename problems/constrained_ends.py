@@ -13,9 +13,12 @@ import numpy as np
 
 from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.constraints.links import Links, in_world
+from apex_ompl.constraints.paths import ConstrainedPaths
 from apex_ompl.goals.pose_goal import POSITION_WEIGHT
 from apex_ompl.goals.state_sampling import has_clearance
 from apex_ompl.kernel import IKSolver, Kernel, SceneTables, offset_target, opposition_target
+from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.problems.constrained_held import Carried, upright_palm
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.types import Array, Flags
@@ -28,6 +31,7 @@ REACHED = 1e-8  # largest residual that counts as reached
 STEPS = 60  # most steps of a descent
 ARM_STATES = 8  # of one arm that are combined with those of the other one
 LIMIT_GAP = 0.02  # of arm joints to their limits, where a closed chain ends [rad]
+TREE_ITERATIONS = 400  # in which trees are to join start and goal
 LINE_STATES = 15  # at which the straight line is looked up, between start and goal
 LINE_MARGIN = 1e-6  # clearance of these states [m]
 
@@ -105,6 +109,18 @@ def line_is_free(carried: Carried, scene: SceneTables, ends: Array) -> bool:
     moved = constraints.project(line)
     kernel = Kernel(carried.held.tables.both, scene)
     return bool(moved.ok.all()) and bool(has_clearance(kernel, moved.states, LINE_MARGIN).all())
+
+
+def are_joined(carried: Carried, ends: Array) -> bool:
+    """Whether trees on the constraints join start and goal, shape (2, dof), without obstacles.
+
+    States of a closed chain may lie in parts that joint limits and the robot itself keep apart.
+    """
+    constraints = ConstraintSet.of(robot(), carried.constraints, carried.held.attached, ends[0])
+    kernel = Kernel(carried.held.tables.both, scene_tables([]))
+    paths = ConstrainedPaths(kernel, constraints, Optimizer(), lambda states: True)
+    trees = paths.trees(ends[:1], ends[1:], np.random.default_rng(0))
+    return trees is not None and trees.grow(TREE_ITERATIONS) is not None
 
 
 def palms_at(carried: Carried, pose: Array) -> list[Array]:
