@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from apex_ompl.collision import CollisionChecker, Contact
     from apex_ompl.constraints.user import UserConstraint
     from apex_ompl.planners import AnyPlanner
-    from apex_ompl.planning.lines import LineResult, Waypoint
+    from apex_ompl.planning.line_query import Waypoint
+    from apex_ompl.planning.lines import LineResult
     from apex_ompl.planning.query import Group, State, Target
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
@@ -353,6 +354,7 @@ class MotionPlanner:
         from apex_ompl.collision.conservative import CheckCounts
         from apex_ompl.ompl.process import Interrupt
         from apex_ompl.planning import lines
+        from apex_ompl.planning.line_query import line_query
         from apex_ompl.planning.query import state_array
         from apex_ompl.timing.parameterization import warm_up
         from apex_ompl.util.clocks import Deadline
@@ -365,7 +367,7 @@ class MotionPlanner:
                     raise ParameterError("world", f"the moving obstacle {changing[0]!r}", "obstacles that stand still")
                 checker = self._checker_without(self._absent())
                 checker.check_counts = CheckCounts()
-                query = lines.line_query(
+                query = line_query(
                     checker, state_array(self.robot, start, "start"), pose, frame=frame, blend=blend, speed=speed,
                     timing=timing, problem=lambda goals: self.problem(start, goals, name),
                 )  # fmt: skip
