@@ -29,12 +29,11 @@ class Mirrored:
         return self.row
 
     def bound(self, q: np.ndarray, step: np.ndarray) -> float:
-        """Return the largest norm over q + u step, |u| <= 1."""
+        """Return a bound on the norm over q + u step, |u| <= 1."""
         return float((np.abs(self.residual(q)) + np.abs(self.row @ step)).sum())
 
 
 problem = load_problem("ball_in_cup")
-start = np.array(list(problem.start.values()))
-result = plan(problem, constraints=[Mirrored(start)])
+result = plan(problem, constraints=[Mirrored(np.array(list(problem.start.values())))])
 print(result)
 assert result and result.constraint_bound["mirrored shoulders"] <= Mirrored.tolerance

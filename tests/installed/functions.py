@@ -91,6 +91,7 @@ def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
     from apex_ompl.planning.planner import check_arguments, kept_planner
+    from apex_ompl.scene import OnPlane
 
     robot = apex_ompl.load_robot("dual_panda_softhand")
     home = robot.home
@@ -115,6 +116,10 @@ def _use_planner() -> None:
         result = planner.plan(home, pose, timeout=20.0, timing=apex_ompl.Timing(velocity_scale=0.9))
         assert result and result.status is apex_ompl.PlanStatus.EXACT_SOLUTION
         assert len(result.path.sample(0.1)) > 1
+        line = planner.plan_line(home, pose, frame="left_hand_palm", timeout=20.0)
+        assert line and line.share == 1.0
+        plane = OnPlane(frame="left_hand_palm", normal=(1.0, 0.0, 0.0))
+        assert planner.plan(home, pose, timeout=20.0, constraints=[plane]).constraint_bound
         assert planner.simple_setup(home, home + 0.01) and planner.problem(home, home).name == "world"
         world.load(planner.problem(home, home))
         world.clear()
