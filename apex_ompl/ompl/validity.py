@@ -16,7 +16,7 @@ from ompl import base as ob
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.path_proof import Curve, PathProof
 from apex_ompl.ompl.simple_setup import RobotSpaceInformation
-from apex_ompl.ompl.space import to_array, to_state
+from apex_ompl.ompl.space import to_array, to_state, values_of
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.timing.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
@@ -174,7 +174,7 @@ class MotionValidator(ob.MotionValidator):
             if self.stop():
                 return False
             if self.decides:
-                return self.check(to_array(first, self.dof), to_array(second, self.dof))
+                return self.check(values_of(first, self.dof), values_of(second, self.dof))
             between = self._between(first, second) if isinstance(self.check, ConstrainedMotionCheck) else None
         except BaseException as error:
             first = second = None
