@@ -66,7 +66,13 @@ class ConstrainedMotionCheck(MotionCheck):
         self.constraints = constraints
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
-        """Whether the motion from ``a`` to ``b`` stays on the manifold and is free; ``a`` is taken to be free."""
+        """Whether the motion from ``a`` to ``b`` stays on the manifold and is free; ``a`` is taken to be free.
+
+        A motion to ``a`` itself is none: OMPL's interpolation returns its start where it fails, and trees would get
+        that state again and again.
+        """
+        if np.array_equal(a, b):
+            return False
         states = self.states(np.asarray(a, float), np.asarray(b, float))
         return states is not None and self.checker.first_collision(states, self.resolution, start=False) is None
 
