@@ -5,15 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.paths import ConstrainedPaths
 from apex_ompl.ompl.own_planner import OwnPlanner, Status
 from apex_ompl.ompl.parameters import Parameters, bounded, register
 from apex_ompl.ompl.repair import exact_paths, simplify
@@ -23,6 +21,9 @@ from apex_ompl.paths.optimizer import Optimizer, OptimizerSettings
 from apex_ompl.paths.path import Path
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
 
 NAME = "rrtconnect+polish"
 TRIES = 3  # of shortening, until another checker accepts the path
@@ -103,6 +104,8 @@ class PolishedRRTConnect(OwnPlanner):
         self, constraints: ConstraintSet, nodes: Array, started: float, ptc: ob.PlannerTerminationCondition
     ) -> Any:
         """Add paths that keep the constraints in place of the nodes that RRTConnect found, and return the status."""
+        from apex_ompl.constraints.paths import ConstrainedPaths
+
         validator, rng = self.validator, np.random.default_rng(0)
 
         def stop() -> bool:

@@ -75,9 +75,14 @@ def bounds_of(si: ob.SpaceInformation, robot: Robot) -> Bounds:
 
 def to_array(state: Any, dof: int) -> Array:
     """Return an OMPL state as an array, shape (dof,)."""
+    return np.array(values_of(state, dof))
+
+
+def values_of(state: Any, dof: int) -> Any:
+    """Return the values of an OMPL state as a list."""
     if isinstance(state, ob.ConstrainedStateSpaceStateType):  # which has no slices
-        return np.array([state[k] for k in range(dof)])
-    return np.array(state[0:dof])
+        return [state[k] for k in range(dof)]
+    return state[0:dof]
 
 
 def set_values(state: Any, q: Array) -> None:

@@ -16,7 +16,7 @@ from ompl import base as ob
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.path_proof import Curve, PathProof
 from apex_ompl.ompl.simple_setup import RobotSpaceInformation
-from apex_ompl.ompl.space import to_array, to_state
+from apex_ompl.ompl.space import to_array, to_state, values_of
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.timing.trajectory import ROUNDING, Trajectory
 from apex_ompl.types import Array
@@ -66,7 +66,13 @@ class ConstrainedMotionCheck(MotionCheck):
         self.constraints = constraints
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> bool:
-        """Whether the motion from ``a`` to ``b`` stays on the manifold and is free; ``a`` is taken to be free."""
+        """Whether the motion from ``a`` to ``b`` stays on the manifold and is free; ``a`` is taken to be free.
+
+        A motion to ``a`` itself is none: OMPL's interpolation returns its start where it fails, and trees would get
+        that state again and again.
+        """
+        if np.array_equal(a, b):
+            return False
         states = self.states(np.asarray(a, float), np.asarray(b, float))
         return states is not None and self.checker.first_collision(states, self.resolution, start=False) is None
 
@@ -174,7 +180,7 @@ class MotionValidator(ob.MotionValidator):
             if self.stop():
                 return False
             if self.decides:
-                return self.check(to_array(first, self.dof), to_array(second, self.dof))
+                return self.check(values_of(first, self.dof), values_of(second, self.dof))
             between = self._between(first, second) if isinstance(self.check, ConstrainedMotionCheck) else None
         except BaseException as error:
             first = second = None

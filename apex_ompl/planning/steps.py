@@ -480,7 +480,8 @@ def _set_up(query: PlanQuery) -> ob.Planner:
         set_goals(simple_setup, [nearest])
         query.notes.append(f"{query.planner} runs threads and takes one goal: the nearest of {len(goals)}")
     if parameters.optimizing:  # others would go on after their first solution, prm for one
-        length = ob.PathLengthOptimizationObjective if setup.constraints is None else ManifoldLength
+        samples = setup.constraints is not None and not parameters.threaded  # threads deadlock with one in Python
+        length = ManifoldLength if samples else ob.PathLengthOptimizationObjective
         simple_setup.setOptimizationObjective(length(si))
     planner = parameters.build(si)
     query.planner = parameters.name or planner.getName()

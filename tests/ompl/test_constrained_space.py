@@ -168,6 +168,7 @@ def test_a_motion_follows_the_projection_of_the_straight_line(robot: Robot, chai
     assert drift(robot, found)[1] < 1e-6
     off = near + np.eye(16)[0]
     assert not check(chained.start, off), "the way there jumps"
+    assert check(chained.start, near) and not check(near, near), "where OMPL's interpolation fails"
 
 
 NAMES = ["rrtconnect", "rrtconnect+polish", "rrt", "prm", "bitstar", "lbkpiece1"]
@@ -198,7 +199,7 @@ def test_the_same_seed_gives_the_same_path(chain: Problem) -> None:
     assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
-@pytest.mark.parametrize("name", ["gpmp", "gpmp2", "damon", "drrt", "aorrtc"])
+@pytest.mark.parametrize("name", ["gpmp", "gpmp2", "damon", "drrt", "aorrtc", "il"])
 def test_planners_that_know_no_constraints_are_refused(chain: Problem, chained: PlanningSetup, name: str) -> None:
     with pytest.raises(ParameterError, match=f"planner: expected one that plans under constraints.*'{name}'"):
         apex_ompl.plan(chain, name)
@@ -270,7 +271,8 @@ def own_setup(robot: Robot, problem: Problem, kind: type, checker: bool) -> tupl
     """A setup as a user writes it, with OMPL's classes."""
     constraints = ConstraintSet.of(robot, [CHAIN], (), robot.home)
     space = kind(state_space(robot), ManifoldConstraint(constraints))
-    si = ob.ConstrainedSpaceInformation(space)
+    bundle = kind is ob.TangentBundleStateSpace
+    si = (ob.TangentBundleSpaceInformation if bundle else ob.ConstrainedSpaceInformation)(space)
     setup = og.SimpleSetup(si)
     free = CollisionChecker(robot)
     if checker:
@@ -283,7 +285,7 @@ def own_setup(robot: Robot, problem: Problem, kind: type, checker: bool) -> tupl
 
 
 @pytest.mark.parametrize("checker", [True, False])
-@pytest.mark.parametrize("kind", [ob.ProjectedStateSpace, ob.AtlasStateSpace])
+@pytest.mark.parametrize("kind", [ob.ProjectedStateSpace, ob.AtlasStateSpace, ob.TangentBundleStateSpace])
 def test_apex_in_a_space_of_a_users_own(robot: Robot, chain: Problem, kind: type, checker: bool) -> None:
     setup, _ = own_setup(robot, chain, kind, checker)
     planner = APEX(setup.getSpaceInformation(), seed=0)
