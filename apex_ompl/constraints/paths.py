@@ -70,8 +70,11 @@ class ConstrainedPaths:
         )
 
     def shortcut(self, nodes: Array, draws: int, rng: np.random.Generator) -> Array:
-        """Return nodes of trees with the same ends, shape (N, dof), after attempts to join random pairs of them."""
-        if self.constraints.rows is None:
+        """Return nodes of trees with the same ends, shape (N, dof), after attempts to join random pairs of them.
+
+        With constraints of a user's own they are returned as they are.
+        """
+        if self.constraints.rows is None or self.constraints.user:
             return nodes
         connection = ManifoldConnection(self.kernel, self.constraints.rows, SEARCH_RESOLUTION)
         for pair in rng.random((draws, 2)):
