@@ -63,8 +63,8 @@ def proposed(job: Job) -> Run:
     """Return the motions that the duration optimizer makes of a model's proposals, without shortening paths before.
 
     Parameters are ``model``, a checkpoint; ``taken_as``: proposals are a ``path``, to which the optimizer gives a first
-    timing, or a ``motion`` whose timing it starts from; and ``repaired``: whether they are repaired as the planner does until
-    one is free, and only that one is taken.
+    timing, or a ``motion`` whose timing it starts from; and ``repaired``: whether they are repaired as the planner does
+    until one is free, and only that one is taken.
     """
     setup, taken_as = assemble(load_problem(job.problem), robot(), job.seed), job.params["taken_as"]
     kernel, start, goal = setup.checker.kernel, setup.start, setup.goals[0]
