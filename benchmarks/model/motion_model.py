@@ -8,10 +8,10 @@ planner without trees, with the objective ``time``; and their proposals alone, f
 as it would from any path, or from the timing of the proposals.
 
 Everything is kept in benchmarks/runs/motion_model and resumed from there; a comparison has a folder of its own for each
-set of checkpoints. Data take 10 minutes of CPU, training 15, the comparison 15.
+set of checkpoints. Data take 10 minutes of CPU, training 10, the comparison 15.
 
 Usage: python -m benchmarks.model.motion_model [SUITE[/LEVEL] ...] [--part data train compare] [--problems 3000]
-       [--steps 2000] [--batch 128] [-n 4]
+       [--steps 1000] [--batch 128] [-n 4]
 """
 
 from __future__ import annotations
@@ -294,7 +294,7 @@ def main() -> None:
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS, help="(default: all)")
     parser.add_argument("--problems", type=one_or_more, default=3000, help="of the data (default: %(default)s)")
-    parser.add_argument("--steps", type=one_or_more, default=2000, help="of a training (default: %(default)s)")
+    parser.add_argument("--steps", type=one_or_more, default=1000, help="of a training (default: %(default)s)")
     parser.add_argument("--batch", type=one_or_more, default=128, help="paths in a step (default: %(default)s)")
     parser.add_argument(
         "--other-paths", action="store_true", help="add rows of the planner whose motions have no other paths"
