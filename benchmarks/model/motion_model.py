@@ -11,7 +11,7 @@ Everything is kept in benchmarks/runs/motion_model and resumed from there; a com
 set of checkpoints. Data take 10 minutes of CPU, training 10, the comparison 15.
 
 Usage: python -m benchmarks.model.motion_model [SUITE[/LEVEL] ...] [--part data train compare] [--problems 3000]
-       [--steps 1000] [--batch 128] [-n 4]
+       [--steps 1000] [--batch 128] [-n 4] [--seeds 2]
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ CONFIG = record.ROOT / "scripts" / "configs" / "apex-continued.yaml"
 PARTS = ("data", "train", "compare")
 APEX = "apex"
 TIMEOUT = 10.0  # of a run [s]
-SEEDS = (0, 1000)  # of the first problem of a level
+SEED_STEP = 1000  # from one seed of a problem to the next
 RATE, WARMUP, EMA = 3e-4, 100, 0.998
 LOG_EVERY = 250  # steps
 DRAWS = 2000  # of the bootstrap
@@ -253,15 +253,16 @@ def compare(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     made_of = digest(*(folder / file for folder in models.values() for file in ("config.json", "model.safetensors")))
     planner, alone = rows_of(models)
     chosen = [*(planner if args.other_paths else planner[: len(models)]), *alone]
+    seeds = [SEED_STEP * k for k in range(args.seeds)]
     made = [
         bench(
             levels, chosen, args.store / f"compare-{made_of}" / str(seed), runs=args.n, timeout=TIMEOUT, seed=seed,
             split="validation", workers=Workers(args.jobs), provenance=record.session(),
         )
-        for seed in SEEDS
+        for seed in seeds
     ]  # fmt: skip
     runs = [
-        run for seed, results in zip(SEEDS, made, strict=True) for run in results.runs
+        run for seed, results in zip(seeds, made, strict=True) for run in results.runs
         if run["seed"] - seed < args.n and run["experiment"] in levels
     ]  # fmt: skip
     args.made_with = made_with(made)
@@ -293,6 +294,7 @@ def main() -> None:
     parser = record.parser(__doc__, n=4, jobs=1)
     parser.add_argument("levels", nargs="*", metavar="SUITE[/LEVEL]")
     parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS, help="(default: all)")
+    parser.add_argument("--seeds", type=one_or_more, default=2, help="of a problem (default: %(default)s)")
     parser.add_argument("--problems", type=one_or_more, default=3000, help="of the data (default: %(default)s)")
     parser.add_argument("--steps", type=one_or_more, default=1000, help="of a training (default: %(default)s)")
     parser.add_argument("--batch", type=one_or_more, default=128, help="paths in a step (default: %(default)s)")
@@ -307,7 +309,7 @@ def main() -> None:
     for part in args.part:
         found[part], text = MEASURES[part](args)
         texts.append(f"## {part.capitalize()}\n\n{text}")
-    about = {"split": "validation", "n": args.n, "seeds": "2 of each problem", "timeout": f"{TIMEOUT:g} s"}
+    about = {"split": "validation", "n": args.n, "seeds": f"{args.seeds} of each problem", "timeout": f"{TIMEOUT:g} s"}
     about |= {"problems": args.problems, "steps": args.steps, "batch": args.batch, "rate": RATE}
     name = "motion_model" if len(args.part) == len(PARTS) else f"motion_model_{'_'.join(args.part)}"
     record.write(name, found, "\n\n".join(texts), args.results, **about, **args.made_with)
