@@ -28,7 +28,7 @@ from benchmarks.model.motion_data import proved, states_in_time
 from benchmarks.planners.head_to_head import TREELESS
 from benchmarks.timing.motion_rows import called, columns_of, lower_bound
 
-PROPOSALS = 4  # of a run
+ALONE, REPAIRED = 2, 4  # proposals of a run without repair, and with it
 LEAST_SPANS = 8
 AS_PATH, AS_MOTION = "path", "motion"
 
@@ -73,7 +73,8 @@ def proposed(job: Job) -> Run:
     query = make_query(setup.checker, start, goal, point=model.sees_point)
     with model.one_thread():
         generator = np.random.default_rng(job.seed)
-        control = model.propose(query, kernel, PROPOSALS, generator=generator).control
+        count = REPAIRED if job.params["repaired"] else ALONE
+        control = model.propose(query, kernel, count, generator=generator).control
     at_proposals = time.process_time() - begun
     for points in repaired(setup, control) if job.params["repaired"] else control:
         states = states_in_time(points, model.spline) if taken_as == AS_MOTION else model.spline.path(points)
