@@ -160,8 +160,8 @@ PLANNER_HEAD = (
     "CPU ms p50", "p95", "of it motion ms p50", "p95",
 )  # fmt: skip
 ALONE_HEAD = (
-    "levels", "row", "N", "solved", "motions of a run (from 2 proposals, or 1 repaired of 4)", "first duration / best p50", "p95",
-    "least duration / best p50", "p95", "CPU ms until the first p50", "p95", "CPU ms of all p50", "p95",
+    "levels", "row", "N", "solved", "motions a run (from 2 proposals, or 1 repaired)", "first duration / best p50",
+    "p95", "least duration / best p50", "p95", "CPU ms until the first p50", "p95", "CPU ms of all p50", "p95",
 )  # fmt: skip
 
 
