@@ -27,7 +27,7 @@ import numpy as np
 from apex_ompl import load_model
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.runs import Run
-from apex_ompl.model.checkpoint import SHIPPED
+from apex_ompl.model.checkpoint import SHIPPED, read_config
 from apex_ompl.training.store import Store
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
@@ -66,6 +66,10 @@ def trained(folder: Path, name: str, steps: int, batch: int) -> Path:
         steps: Number of steps.
         batch: Paths in a step.
     """
+    run = folder / f"trained-{name}-{steps}x{batch}"
+    run.mkdir(parents=True, exist_ok=True)
+    if (run / "checkpoint").is_dir() and read_config(run / "checkpoint").trained["step"] == steps:
+        return run
     import torch
 
     from apex_ompl.training.config import TrainingConfig
@@ -76,11 +80,7 @@ def trained(folder: Path, name: str, steps: int, batch: int) -> Path:
     changes: dict[str, Any] = {"data": str(folder / name), "initial": APEX, "cases": None, "parts": 0.0}
     changes |= {"robot": str(SOURCE.parent / "robot.npz"), "steps": steps, "batch": batch, "rate": RATE}
     changes |= {"warmup": WARMUP, "ema": EMA, "log_every": LOG_EVERY}
-    run = folder / f"trained-{name}-{steps}x{batch}"
-    run.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(TrainingConfig.read(CONFIG, changes), run, DistributedProcess.current())
-    if not trainer.done:
-        trainer.run()
+    Trainer(TrainingConfig.read(CONFIG, changes), run, DistributedProcess.current()).run()
     return run
 
 
