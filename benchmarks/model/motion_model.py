@@ -119,7 +119,7 @@ def train(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     head, lines = ["trained on", "steps", "batch", "minutes", "step", "loss", "held-out loss"], []
     for name in (MOTIONS, PATHS):
         log = read_log(trained(args.store, name, args.steps, args.batch))
-        for row in log[:: max(1, len(log) // 4)] + log[-1:]:
+        for row in log:
             seconds = float(log[-1]["seconds"])
             lines.append(
                 [name, args.steps, args.batch, f"{seconds / 60:.0f}", row["step"], row["loss"], row["held_out"]]
