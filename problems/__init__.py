@@ -8,6 +8,8 @@ training, 800 000 to 899 999 for validation, 900 000 to 999 999 for tests.
   ``broad`` is for training alone, and ``unseen``, which it draws too, for validation alone.
 - ``broad_parts``: parts of scenes and their algebra; ``broad_furniture``, ``broad_structures``, ``broad_unseen``: the
   grammars; ``broad_tasks``, ``broad_representation``: held objects, ends, difficulty, and how a scene is given.
+- ``constrained``: levels with constraints along the path, ``shelf/tray/900012``; ``constrained_held``,
+  ``constrained_scenes``, ``constrained_ends``: trays and cups, scenes for trays, starts and goals.
 - ``frozen``: the stored problems of validation and test, with their witnesses.
 """
 

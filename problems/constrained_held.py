@@ -87,7 +87,7 @@ def draw_carried(rng: np.random.Generator, kind: str) -> Carried:
 def carried_tray(size: TraySize, *, loaded: bool) -> Carried:
     """Return a tray in both hands, with a cup on it where it is ``loaded``."""
     left, right = robot().hands.values()
-    in_palm: Array = np.linalg.inv(size.palm(0)).astype(float)
+    in_palm = np.asarray(np.linalg.inv(size.palm(0)), float)
     box = (size.depth, 2.0 * size.half_length, THICKNESS)
     tray = {"name": "tray", "box": box, "links": (left.palm, right.palm), **_rounded(in_palm)}
     bodies = [AttachedObject.model_validate(tray)]

@@ -61,8 +61,8 @@ def shelf(rng: np.random.Generator, kind: str, size: TraySize) -> TrayTask:
     width = 2.0 * (size.half_length + HAND) + rng.uniform(0.15, 0.45)
     height, x = rows * gap, front + depth / 2
     scene = [box(f"board_{k}", (depth, width, BOARD), (x, 0.0, low + k * gap)) for k in range(rows + 1)]
-    for name, y in (("upright_right", -width / 2), ("upright_left", width / 2)):
-        scene.append(box(name, (depth, BOARD, height + BOARD), (x, y, low + height / 2)))
+    for name, y in (("right", -width / 2), ("left", width / 2)):
+        scene.append(box(f"upright_{name}", (depth, BOARD, height + BOARD), (x, y, low + height / 2)))
     if rng.random() < 0.7:
         scene.append(box("back", (BOARD, width + BOARD, height + BOARD), (front + depth, 0.0, low + height / 2)))
     side = (width / 2 - size.half_length - HAND) * 0.6

@@ -97,7 +97,7 @@ def plan_with_apex(job: Job) -> Run:
     robot = load_robot(problem.robot)
     with timed(times, "check"):
         spacing = DENSE / float(robot.limits.velocity.max())
-        motion = result.trajectory.sample(spacing).positions
+        motion = result.trajectory.sample(spacing).position
         checks = [dense_check(robot, problem, states) for states in (result.path.states, motion)]
     passed = all(checks)
     first = times.get(FIRST, times["solve"])

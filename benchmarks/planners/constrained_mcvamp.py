@@ -190,7 +190,7 @@ def run(problem: Problem) -> dict[str, Any]:
     }
     if result and result.path is not None and result.trajectory is not None:
         robot = load_robot(problem.robot)
-        motion = result.trajectory.sample(DENSE / float(robot.limits.velocity.max())).positions
+        motion = result.trajectory.sample(DENSE / float(robot.limits.velocity.max())).position
         checks = [dense_check(robot, ready, states) for states in (result.path.states, motion)]
         found |= {"solved": all(checks), "violation": max(check.violation for check in checks)}
     return found

@@ -11,8 +11,10 @@ import pytest
 
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.problems import constrained
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.problems import constrained, frozen
 from apex_ompl.problems.broad_tasks import Held
 from apex_ompl.problems.catalogue import CONSTRAINED, ProblemId, first_drawn, levels_of
 from apex_ompl.problems.constrained_ends import line_is_free
@@ -140,3 +142,24 @@ def test_levels_with_constraints_are_apart_from_the_others() -> None:
         problems.load("bins/tray/12")
     with pytest.raises(UnknownNameError, match="did you mean 'cups'"):
         problems.load("shelf/cup/12")
+
+
+FROZEN = [pair for pair in LEVELS if frozen.exists(*pair)]
+
+
+@pytest.mark.parametrize(("suite", "level"), FROZEN)
+def test_witnesses_keep_the_constraints_and_are_free(robot: Robot, suite: str, level: str) -> None:
+    split = "validation" if suite == "unseen" else "test"
+    names = problems.frozen_names(suite, level, split)
+    assert len(names) == frozen.COUNTS[split]["unseen constrained" if suite == "unseen" else "constrained"]
+    for name in names[::9]:
+        problem, witness = problems.load(name), problems.witness(name)
+        states = ends(problem, robot)
+        assert np.array_equal(witness.path[[0, -1]], states)
+        path = frozen.on_constraints(problem, witness.path)
+        assert path is not None
+        checker = CollisionChecker(robot, problem.scene, problem.attached)
+        constraints = ConstraintSet.of(robot, problem.constraints, problem.attached, states[0])
+        check = full_check(checker, path, states[0], states[1:], constraints=constraints)
+        assert check, check.reason
+        assert problem.constraints == first_drawn(ProblemId(suite, level, UNFROZEN))[1].constraints
