@@ -93,13 +93,14 @@ def convert(parsed: argparse.Namespace) -> int:
 def problems(_: argparse.Namespace) -> int:
     """List problems and suites."""
     from apex_ompl import problems as package
+    from apex_ompl.problems.catalogue import levels_of
 
     for name in package.names():
         problem = package.load(name)
         print(f"{name:<20} {problem.robot}, {len(problem.scene)} obstacles")
     print("suites, as SUITE/LEVEL/SEED; seeds 0 to 799999 train, from 800000 validate, from 900000 test")
-    for suite, levels in package.suites().items():
-        print(f"{suite:<20} {', '.join(levels)}")
+    for suite in package.suites():
+        print(f"{suite:<20} {', '.join(levels_of(suite))}")
     return 0
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from apex_ompl import planners, problems
 from apex_ompl.api import load_problem
 from apex_ompl.errors import ParameterError
-from apex_ompl.problems.catalogue import SPLITS, VALIDATION
+from apex_ompl.problems.catalogue import SPLITS, VALIDATION, levels_of
 from apex_ompl.util.validation import check_integer, check_name, check_positive
 
 RUNNER = re.compile(r"[\w.]+:\w+")
@@ -190,7 +190,7 @@ def experiments(suites: Sequence[str]) -> dict[str, bool]:
         if name in known:
             static = [v for v in known[name] if not v.startswith("moving-")]
             found |= {f"{name}/{v}": True for v in static}
-        elif suite in known and level in known[suite]:
+        elif suite in known and level in levels_of(suite):
             found[name] = True
         else:
             load_problem(name)
