@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from support import benchmark_script
 
 from apex_ompl import problems
 from apex_ompl.errors import ApexError, UnknownNameError
@@ -17,15 +18,12 @@ from apex_ompl.scene.bodies import pose_matrix
 from apex_ompl.scene.constraints import FixedOrientation, OnLine, OnPlane, RelativePose, ToolRegion, Upright
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
-from benchmarks.planners import constrained, constrained_mcvamp
-from benchmarks.planners.constrained_check import (
-    DENSE,
-    FrameReader,
-    all_constraints,
-    arm_joints,
-    dense_check,
-    residual_of,
-)
+
+constrained = benchmark_script("planners.constrained")
+constrained_mcvamp = benchmark_script("planners.constrained_mcvamp")
+check = benchmark_script("planners.constrained_check")
+DENSE, FrameReader, all_constraints = check.DENSE, check.FrameReader, check.all_constraints
+arm_joints, dense_check, residual_of = check.arm_joints, check.dense_check, check.residual_of
 
 POSE = {"tool": np.eye(4)}
 
