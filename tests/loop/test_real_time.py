@@ -89,7 +89,7 @@ def test_a_killed_planner_whose_child_lives_on_is_replaced() -> None:
     faults = [event for event in done.events if event.kind == "planner fault"]
     asked = [event.time for event in done.events if event.kind == "request"]
     assert process.restarts and faults[0].data["what"] == "the planner process died"
-    assert faults[0].time < asked[1] + 1.0, "and not only where it did not answer for long"
+    assert faults[0].time < asked[1] + 3.0, "and not only where it did not answer for long"
 
 
 def test_a_planner_that_never_answers_ends_defined() -> None:
