@@ -83,13 +83,12 @@ def test_faults_of_the_planner_end_defined() -> None:
     assert process.restarts and any(event.kind == "planner fault" for event in done.events)
 
 
-def test_a_killed_planner_whose_child_lives_on_is_replaced() -> None:
+def test_a_killed_planner_whose_child_lives_on_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replanning, "HUNG", math.inf)  # its death alone is noticed, and not that it does not answer
     done, report, process = go("orphaned")
     check_defined(done, report, process)
     faults = [event for event in done.events if event.kind == "planner fault"]
-    asked = [event.time for event in done.events if event.kind == "request"]
     assert process.restarts and faults[0].data["what"] == "the planner process died"
-    assert faults[0].time < asked[1] + 3.0, "and not only where it did not answer for long"
 
 
 def test_a_planner_that_never_answers_ends_defined() -> None:
