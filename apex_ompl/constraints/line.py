@@ -30,6 +30,7 @@ import pinocchio as pin
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.products import product
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
 
 TURN = 0.2  # length that counts as much as an angle [m/rad]
 SAME_POINT, SAME_TURN = 1e-9, 1e-9  # lengths [m] and angles [rad] that count as none
@@ -127,7 +128,7 @@ class ToolPath:
         """Return rotations, shape (N, F, 3, 3), and origins, shape (N, F, 3) [m], at parameters of shape (N,)."""
         which, frames = self._which(u), len(self.pieces[0].point)
         rotation, point = np.empty((len(u), frames, 3, 3)), np.empty((len(u), frames, 3))
-        for k in np.unique(which).tolist():
+        for k in distinct(which).tolist():
             rows, piece = which == k, self.pieces[k]
             back, ahead = _shares(piece, u[rows])
             for f in range(frames):
@@ -143,7 +144,7 @@ class ToolPath:
         """Return d p / du, shape (N, F, 3), and the angular velocity in the world, shape (N, F, 3) [rad/m]."""
         which, rotation = self._which(u), self.poses(u)[0]
         velocity, angular = np.empty((len(u), rotation.shape[1], 3)), np.empty((len(u), rotation.shape[1], 3))
-        for k in np.unique(which).tolist():
+        for k in distinct(which).tolist():
             rows, piece = which == k, self.pieces[k]
             tau = ((u[rows] - piece.low) / piece.length)[:, None]
             for f in range(rotation.shape[1]):

@@ -26,6 +26,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.line import TURN, ToolPath
 from apex_ompl.constraints.tools import Linearization, Tool, Tools, null_directions, pose_errors
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import distinct
 
 Stop = Callable[[], bool]
 
@@ -97,7 +98,7 @@ class LineTracker:
         self.checker, self.tools, self.path, self.stop = checker, Tools(checker.kernel, tools), path, stop
         limits = checker.robot.limits
         self.lower, self.upper = limits.lower, limits.upper
-        self.moving = np.unique(np.concatenate([tool.columns for tool in tools]))
+        self.moving = distinct(np.concatenate([tool.columns for tool in tools]))
         self.grid = path.grid(SPACING)
 
     def follow(self, start: Array) -> Track:

@@ -24,6 +24,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at, problem_at, script_times, velocity_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
 from apex_ompl.util.validation import check_states, check_times, number_array
 
 SLICE, SHORTEST_SLICE = 0.02, 0.00125  # lengths of slices of time that are checked by exact shapes [s]
@@ -131,7 +132,7 @@ class TimedProver:
         for o in self.obstacles:
             exact.move(o.name, obstacle_at(o, 0.5 * (start + end)).position)
         inner = motion.times[(motion.times > start) & (motion.times < end)]
-        knots = np.unique(np.concatenate([[start], inner, [min(end, max(motion.duration, start))]]))
+        knots = distinct(np.concatenate([[start], inner, [min(end, max(motion.duration, start))]]))
         curve = Curve.cubic(knots, *motion.states(knots))
         return exact.prove(curve, tolerance=0.0).reason
 

@@ -215,6 +215,7 @@ def constraint_set(
     """
     if not (problem.constraints or constraints or any(one.links is not None for one in problem.attached)):
         return None
+    from apex_ompl.constraints import paths  # noqa: F401 - which searches need: a fork waits for what is imported here
     from apex_ompl.constraints.constraint_set import ConstraintSet
 
     hands = (hand.synergy for hand in robot.hands.values() if hand.synergy is not None)

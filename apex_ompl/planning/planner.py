@@ -261,19 +261,19 @@ class MotionPlanner:
             ApexError: The planner, a parameter or an option is faulty.
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
-        from apex_ompl.apex.models import has_model
-        from apex_ompl.apex.parameters import NAME
-        from apex_ompl.collision.conservative import CheckCounts
-        from apex_ompl.ompl.process import Interrupt, quiet_ompl
-        from apex_ompl.planning import motions, steps
-        from apex_ompl.planning.departure import departed, with_departure
-        from apex_ompl.planning.query import dynamic_of, snapshot_notes
-        from apex_ompl.timing import Timing
+        with unforked():
+            from apex_ompl.apex.models import has_model
+            from apex_ompl.apex.parameters import NAME
+            from apex_ompl.collision.conservative import CheckCounts
+            from apex_ompl.ompl.process import Interrupt, quiet_ompl
+            from apex_ompl.planning import motions, steps
+            from apex_ompl.planning.departure import departed, with_departure
+            from apex_ompl.planning.query import dynamic_of, snapshot_notes
+            from apex_ompl.timing import Timing
 
         options.check()
         robot, leave_contact = self.robot, options.leave_contact
-        wanted = Timing() if options.timing is True else options.timing
-        timing = wanted if isinstance(wanted, Timing) else None
+        timing = Timing() if options.timing is True else options.timing or None
         changing = self._checker.changing_obstacles
         dynamic = () if options.snapshot else dynamic_of(changing)
         if dynamic:
@@ -351,13 +351,14 @@ class MotionPlanner:
             ApexError: The start, a pose, a frame, or an option is faulty.
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
-        from apex_ompl.collision.conservative import CheckCounts
-        from apex_ompl.ompl.process import Interrupt
-        from apex_ompl.planning import lines
-        from apex_ompl.planning.line_query import line_query
-        from apex_ompl.planning.query import state_array
-        from apex_ompl.timing.parameterization import warm_up
-        from apex_ompl.util.clocks import Deadline
+        with unforked():
+            from apex_ompl.collision.conservative import CheckCounts
+            from apex_ompl.ompl.process import Interrupt
+            from apex_ompl.planning import lines
+            from apex_ompl.planning.line_query import line_query
+            from apex_ompl.planning.query import state_array
+            from apex_ompl.timing.parameterization import warm_up
+            from apex_ompl.util.clocks import Deadline
 
         check_arguments(timeout, 0)
         with running(), self._lock:

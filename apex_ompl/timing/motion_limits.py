@@ -19,6 +19,7 @@ from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.timing.curve import Polyline
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
 
 SHARE = 0.999  # share of a limit that motions are slowed down to, since torques are sampled
 SPACING = 0.02  # largest spacing of samples in time [s]
@@ -222,7 +223,7 @@ def _largest(motion: Trajectory, measure: Measure) -> Largest:
     peaks = np.argsort(largest)[-PEAKS:]
     peaks = peaks[largest[peaks] >= NEAR * largest.max()]
     around = np.arange(-FINER, FINER + 1) * (spacing / FINER)
-    fine = np.unique(np.clip(times[peaks, None] + around, 0.0, end))
+    fine = distinct(np.clip(times[peaks, None] + around, 0.0, end))
     times, values = np.append(times, fine), np.append(values, measure(motion, fine), axis=0)
     row, column = np.unravel_index(int(values.argmax()), values.shape)
     return Largest(float(values[row, column]), int(column), float(times[row]))

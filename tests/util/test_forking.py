@@ -39,6 +39,40 @@ def test_a_child_plans_while_its_parent_prepares_its_first_plan(planner: str, af
     assert ended.returncode == 0, (ended.returncode, ended.stderr)
 
 
+IMPORTS = """
+import sys, threading, apex_ompl
+from apex_ompl.util import forking
+unsafe = []
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if threading.get_ident() not in forking._gate._preparing: unsafe.append(name)
+sys.meta_path.insert(0, Finder())
+def line():
+    planner = apex_ompl.MotionPlanner("dual_panda_softhand")
+    start = planner.robot.home
+    return planner.plan_line(start, (0.31, 0.44, 0.49), frame="left_hand", timeout=20.0)
+def among():
+    ball = apex_ompl.Obstacle(name="ball", sphere={"radius": 0.05}, position=(0.9, 0.0, 1.2), velocity=(0.1, 0.0, 0.0))
+    problem = apex_ompl.load_problem("shelf_swap")
+    return apex_ompl.plan(problem.model_copy(update={"scene": (*problem.scene, ball)}), timeout=20.0)
+assert eval(sys.argv[1])
+sys.exit(f"imported while a fork would not wait: {unsafe}" if unsafe else 0)
+"""
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        "apex_ompl.plan('shelf_swap')", "apex_ompl.plan('carry_tray')", "line()", "among()",
+        "apex_ompl.plan('shelf_swap', 'rrtconnect+polish', objective='calm')",
+    ],
+)  # fmt: skip
+def test_what_plans_import_is_imported_while_forks_wait(plan: str) -> None:
+    """A fork in the middle of an import leaves its lock shut in the child, which then waits for ever."""
+    ended = subprocess.run([sys.executable, "-c", IMPORTS, plan], check=False, capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+
+
 def exit_code_of_child(work: Callable[[], bool]) -> int:
     """What a forked child makes of some work; 9 where it took too long."""
     child = os.fork()
