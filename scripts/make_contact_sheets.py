@@ -1,6 +1,7 @@
 """Draw problems of every suite and level into docs/pictures/suites, one sheet a suite: start, and goal as a ghost.
 
-The sheets of ``broad`` and ``unseen``, with one problem for each grammar, are drawn only if they are named.
+The sheets of ``broad`` and ``unseen``, with one problem for each grammar, and of ``constrained``, the levels with
+constraints of all suites, are drawn only if they are named.
 
 Usage: python scripts/make_contact_sheets.py [--first 0] [--columns 3] [SUITE ...]
 """
@@ -17,7 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from apex_ompl import problems
 from apex_ompl.problems.broad import GRAMMARS
-from apex_ompl.problems.catalogue import SPLITS, TRAINING
+from apex_ompl.problems.catalogue import CONSTRAINED, SPLITS, TRAINING
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.validation import one_or_more, whole_number
@@ -27,6 +28,7 @@ OUT = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "suites"
 SIZE, DRAWN = (400, 300), (1200, 900)  # of a picture on the sheet, and as it is drawn [pixels]
 FROM_BEHIND = {"shelf": 150.0, "swap": 150.0}
 FROM_ABOVE_LEFT = 40.0
+WITH_CONSTRAINTS = "constrained"
 SOME_MOVING = ("moving-small-0.1", "moving-large-0.2", "moving-huge-0.4")
 
 
@@ -49,7 +51,13 @@ def _tiled(names: list[str], columns: int) -> Image.Image:
 
 
 def sheet(suite: str, first: int, columns: int) -> Image.Image:
-    """Return the sheet of a suite: a row a level; of ``broad`` and ``unseen`` a problem a level."""
+    """Return the sheet of a suite: a row a level; of ``broad`` and ``unseen`` a problem a level.
+
+    That of ``constrained`` has a row for each suite, with a problem of each level with constraints.
+    """
+    if suite == WITH_CONSTRAINTS:
+        seed = SPLITS["validation"][first]
+        return _tiled([f"{one}/{level}/{seed}" for one, levels in CONSTRAINED.items() for level in levels], 3)
     if suite in GRAMMARS:
         split = SPLITS["train" if suite in TRAINING else "validation"]
         return _tiled([f"{suite}/{level}/{split[first]}" for level in GRAMMARS[suite]], columns)

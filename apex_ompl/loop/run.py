@@ -59,6 +59,9 @@ def run_in(
     with quiet_ompl():
         seed_ompl(seed)
         setup = assemble(environment.problem.still, seed=seed)
+        if setup.constraints is not None:
+            kept = f"the {setup.constraints.names[0]} along the path"
+            raise ParameterError("problem", kept, "no constraint: replanned motions would not keep it")
         timing = Timing(velocity_scale=speed)
         limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
         context = RunContext(setup, _within(limits), _within(setup.robot.limits), used)

@@ -58,6 +58,7 @@ class PlanningSetup:
         constraints: Constraints along the path, or None where there are none.
         start_off: Which of them the start violates, and by how much, or empty.
         goals_off: Which of them each goal violates, or empty; those that do are not given to OMPL unless all do.
+        further_constraints: Those that the problem does not list.
         seed: Seed of the sampling of goals, and of the plan.
         notes: Sentences on joints of the start and the goals that were moved to their limits, and on meshes that are no
             proper solids, and how they are interpreted.
@@ -79,6 +80,7 @@ class PlanningSetup:
     constraints: ConstraintSet | None
     start_off: str
     goals_off: tuple[str, ...]
+    further_constraints: tuple[Constraint | UserConstraint, ...]
     seed: int
     notes: tuple[str, ...]
 
@@ -192,6 +194,7 @@ def assemble(
         along,
         start_off,
         goals_off,
+        tuple(constraints),
         seed,
         (*notes, *checker.mesh_notes),
     )

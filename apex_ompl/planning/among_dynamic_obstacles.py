@@ -2,7 +2,8 @@
 
 1. A path among the static obstacles is found and timed. Where its motion meets no dynamic obstacle, it is the plan.
 2. Otherwise the motion along the path is retimed: it waits, slows down or speeds up (:mod:`apex_ompl.moving.retime`).
-3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.motion_optimizer`).
+3. Motions are optimized in space and time from several paths and durations (:mod:`apex_ompl.moving.motion_optimizer`);
+   not under constraints.
 4. Where all that fails, paths are planned around the volumes that the dynamic obstacles sweep.
 
 The motion that arrives first is taken.
@@ -14,11 +15,11 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.kernel import Kernel
 from apex_ompl.moving.motion_optimizer import InitialMotion, MotionOptimizer, shortest_duration
 from apex_ompl.moving.retime import retime
@@ -27,7 +28,7 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.paths.path import Path
-from apex_ompl.planning.steps import FoundPath, PlanQuery, finish, prove, query_fault, solve, time
+from apex_ompl.planning.steps import FoundPath, PlanQuery, constraint_fields, finish, prove, query_fault, solve, time
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
@@ -45,8 +46,6 @@ PATH_STATES = (256, 1024)  # of the path of a motion, the first number for which
 SWEPT_SECONDS = 6.0  # of the dynamic obstacles' motions that paths are planned around [s]
 SWEPT_SHARE = 0.3  # of the time that is left, for that
 SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places [m], and the largest number of these
-
-
 NEAREST_GOALS = 2  # nearest goals of which there are several
 PERTURBATIONS = 4  # of the straight line to each goal
 
@@ -81,20 +80,27 @@ class Among:
         lower[setup.held] = upper[setup.held] = setup.start[setup.held]
         return setup.checker.kernel.within(lower, upper)
 
-    def proof(self, motion: Trajectory) -> PathProof | None:
-        """Return the certificate that a motion is clear of static obstacles and of itself, or None.
+    def fields(self, motion: Trajectory) -> dict[str, Any] | None:
+        """Return what a result says of the proof of a motion, or None.
 
-        It is None, too, where the motion meets a dynamic obstacle, or does not go from the start to a goal.
+        It is None where the motion is not proved to be clear of the static obstacles, of the dynamic ones and of
+        itself, does not keep the constraints, or does not go from the start to a goal.
         """
         setup = self.query.setup
         if not self.prover.prove(motion, stop=self.stop):
             return None
-        check = full_check(setup.checker, motion, setup.start, setup.goals, deadline=self.query.deadline.at)
-        return check.proof if check else None
+        along = setup.constraints
+        check = full_check(
+            setup.checker, motion, setup.start, setup.goals, deadline=self.query.deadline.at, constraints=along
+        )
+        if not check or check.proof is None:
+            return None
+        kept = {} if along is None or check.constraints is None else constraint_fields(along, check.constraints)
+        return {"motion_clearance": check.proof.clearance} | kept
 
     def accepts(self, motion: Trajectory) -> bool:
         """Whether a motion has a proof."""
-        return self.proof(motion) is not None
+        return self.fields(motion) is not None
 
 
 def plan_among_dynamic_obstacles(
@@ -122,6 +128,8 @@ def plan_among_dynamic_obstacles(
     if prover.fault_at_start(setup.start):
         prover = TimedProver(setup.checker, dynamic, problem.allowed)
     robot = setup.robot
+    if setup.constraints is not None:
+        stages = [stage for stage in stages if stage != SPACE_TIME]  # which knows no constraints
     among = Among(query, prover, timing, timing.limits(robot.limits, robot.joint_names), stages)
     still = time(prove(solve(query), simplify), timing)
     if not still or still.trajectory is None:
@@ -167,13 +175,13 @@ def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
     motion, kernel = still.trajectory, among.kernel
     assert motion is not None
     made = retime(kernel, among.prover.dynamic, motion, among.limits, hold=0.0)
-    proof = None if made.trajectory is None else among.proof(made.trajectory)
-    if made.trajectory is None or proof is None:
+    fields = None if made.trajectory is None else among.fields(made.trajectory)
+    if made.trajectory is None or fields is None:
         return None
     return replace(
         still, trajectory=made.trajectory, solved_by=f"{still.solved_by}+{RETIMED}", timing_method=RETIMED,
         deviation=still.deviation + math.sqrt(motion.dof) * made.deviation,
-        limit_use=made.trajectory.use(among.query.setup.robot.limits), motion_clearance=proof.clearance,
+        limit_use=made.trajectory.use(among.query.setup.robot.limits), **fields,
     )  # fmt: skip
 
 
@@ -242,7 +250,9 @@ def _around_sweeps(among: Among, simplify: bool) -> PlanResult | None:
     names = [name for k, name in enumerate(robot.joint_names) if k not in query.setup.held]
     swept = [copy for o in among.prover.obstacles for copy in _sweep(o)]
     blocked = problem.still.model_copy(update={"scene": (*problem.still.scene, *swept)})
-    setup = replace(assemble(blocked, robot, seed=query.setup.seed, moving=names), problem=problem)
+    further = query.setup.further_constraints
+    setup = assemble(blocked, robot, seed=query.setup.seed, moving=names, constraints=further)
+    setup = replace(setup, problem=problem)
     deadline = Deadline(max(1e-3, SWEPT_SHARE * query.deadline.remaining))
     status, reason, _ = query_fault(setup)
     inner = replace(query, setup=setup, deadline=deadline, status=status, reason=reason, rejected_lines=[])
@@ -264,8 +274,8 @@ def _sweep(obstacle: Obstacle) -> list[Obstacle]:
 
 def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) -> PlanResult | None:
     """Return a result with another motion and with its path, or None."""
-    query, proof = among.query, among.proof(motion)
-    if proof is None:
+    query, fields = among.query, among.fields(motion)
+    if fields is None:
         return None
     for count in PATH_STATES:
         times = np.linspace(0.0, motion.duration, count)
@@ -282,8 +292,7 @@ def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) ->
     exact = FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(states), solved_by, check.proof)
     return replace(
         exact.result(), trajectory=motion, limit_use=motion.use(query.setup.robot.limits), timing_method=method,
-        deviation=float(largest * (times[1] - times[0]) ** 2 / 8.0),
-        motion_clearance=proof.clearance,
+        deviation=float(largest * (times[1] - times[0]) ** 2 / 8.0), **fields,
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import PlanningSetup, assemble, state_fault
 from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult
@@ -98,7 +99,12 @@ def departed(setup: PlanningSetup, most: float, seed: int) -> tuple[Departure | 
         setup: The problem.
         most: Largest depth of a contact [m].
         seed: Seed of the directions, and of the goals that are sampled again.
+
+    Raises:
+        ParameterError: There are constraints along the path, which such a motion would not keep.
     """
+    if setup.constraints is not None:
+        raise ParameterError("leave_contact", most, f"0, since there is a constraint: {setup.constraints.names[0]}")
     departure = find_departure(setup, most, seed) if setup.start_fault else None
     if departure is None:
         return None, setup

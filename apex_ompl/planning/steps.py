@@ -176,7 +176,7 @@ class FoundPath:
             robot_digest=digest(robot), nearest_state=query.nearest_state,
         )  # fmt: skip
         if self.constraints is not None and query.setup.constraints is not None:
-            result = replace(result, **_constraint_fields(query.setup.constraints, self.constraints))
+            result = replace(result, **constraint_fields(query.setup.constraints, self.constraints))
         return result if proof is None else replace(result, **certificate(proof))
 
 
@@ -188,7 +188,7 @@ def certificate(proof: PathProof) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _constraint_fields(constraints: ConstraintSet, kept: ConstraintCertificate) -> dict[str, Any]:
+def constraint_fields(constraints: ConstraintSet, kept: ConstraintCertificate) -> dict[str, Any]:
     """Return what a result says of the constraints along its path and its motion."""
     return {
         "constraint_violation": dict(zip(constraints.names, kept.violations.tolist(), strict=True)),
@@ -607,7 +607,7 @@ def _timed(query: PlanQuery, path: Path, timing: Timing, result: PlanResult) -> 
         from apex_ompl.constraints.proof import prove_motion
 
         kept = prove_motion(setup.constraints, made.trajectory)
-        result = replace(result, **_constraint_fields(setup.constraints, kept))
+        result = replace(result, **constraint_fields(setup.constraints, kept))
     use = made.trajectory.use(limits) | ({} if more is None else more.use(made.trajectory))
     return replace(
         result, trajectory=made.trajectory, limit_use=use, deviation=made.deviation,

@@ -98,6 +98,7 @@ def test_whoever_is_late_and_comes_to_rest_at_the_goal_has_reached_it() -> None:
      ({"speed": -1.0}, "velocity_scale|speed"), ({"speed": 1.5}, "velocity_scale|speed"), ({"seed": -1}, "seed"),
      ({"seed": 0.5}, "seed"), ({"method": 5}, "method: expected the name of a replanner, .*, got 5"),
      ({"clock": None}, "unknown clock None"),
+     ({"problem": "carry_tray"}, "problem: expected no constraint: .*, got 'the upright of tray"),
      ({"prediction": []}, "unknown prediction"), ({"settings": 5}, "settings: expected a LoopSettings, got 5"),
      ({"speed": 10**400}, "velocity_scale")],
 )  # fmt: skip

@@ -217,8 +217,9 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
     started, spent = time.monotonic(), []
     with PlannerProcess(work) as process:
         for number in (1, 2, 3):
-            none = DynamicObstacles([])
-            process.submit(Request(number, 0.0, 1.0, standing, None, none, 0.0, (), math.inf, 0))
+            request = Request(number, 0.0, 1.0, standing, None, DynamicObstacles([]), 0.0, (), math.inf, 0)
+            while not process.submit(request):  # the one before is still being sent
+                assert time.monotonic() < started + 60.0
             while number != 2 and (not spent or spent[-1].number != number):
                 assert time.monotonic() < started + 60.0
                 reply = process.reply(0.0)

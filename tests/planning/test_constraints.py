@@ -10,11 +10,14 @@ import pytest
 from planning import cached_problem
 
 from apex_ompl import plan
-from apex_ompl.errors import UnknownNameError
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanResult, PlanStatus
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.constraints import OnPlane, Upright
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
 
 HANDS = "left_hand_palm", "right_hand_palm"
@@ -82,6 +85,36 @@ def test_cups_stay_upright() -> None:
         axis = cup.pose[:3, :3] @ np.array([0.0, 0.0, 1.0])
         worst = max(tilt(q, cup.link, axis) for q in dense(result)[::7])
         assert 0.0 < worst <= constraint.angle + 1e-9
+
+
+def test_the_tray_waits_for_what_crosses_its_way(carried: PlanResult) -> None:
+    motion = carried.trajectory
+    assert motion is not None
+    half = 0.5 * motion.duration
+    hands = [placement(motion(half), hand).translation for hand in HANDS]
+    velocity = np.array([0.0, 0.0, -0.4])
+    ball = Obstacle(
+        name="ball", sphere={"radius": 0.06}, position=tuple(np.mean(hands, axis=0) - half * velocity),
+        velocity=tuple(velocity),
+    )  # fmt: skip
+    problem = cached_problem("carry_tray")
+    crossed = problem.model_copy(update={"scene": (*problem.scene, ball)})
+    result = plan(crossed, timeout=20.0)
+    assert result and result.dynamic_obstacles == ("ball",) and result.trajectory is not None
+    assert not np.array_equal(result.trajectory.times, motion.times), "or the ball is not in the way"
+    first, second = (placement(motion.positions[0], hand) for hand in HANDS)
+    wanted = first.actInv(second)
+    for time in np.linspace(0.0, result.trajectory.duration, 300):
+        q = result.trajectory(time)
+        assert CollisionChecker(robot(), problem_at(crossed, float(time)).scene, problem.attached).is_free(q)
+        found = placement(q, HANDS[0]).actInv(placement(q, HANDS[1]))
+        off = np.linalg.norm(found.translation - wanted.translation)
+        assert off <= result.constraint_bound["closed chain of tray"] <= 1e-3
+
+
+def test_a_contact_is_not_left_under_a_constraint() -> None:
+    with pytest.raises(ParameterError, match="leave_contact: expected 0, since there is a constraint: upright of tray"):
+        plan(cached_problem("carry_tray"), leave_contact=0.001)
 
 
 def test_the_same_seed_gives_the_same_path(carried: PlanResult) -> None:
