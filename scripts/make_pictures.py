@@ -1,4 +1,4 @@
-"""Draw every ready-made problem, and the motions that README and the page of the baselines show, into docs/pictures.
+"""Draw every ready-made problem, and the motions that README and pages of docs show, into docs/pictures.
 
 Usage: python scripts/make_pictures.py
 """
@@ -31,9 +31,9 @@ def main() -> None:
     for name in problems.names():
         render(load_problem(name), OUT / f"{name}.png", SIZE, FROM_BEHIND.get(name, 26.0))
         print(OUT / f"{name}.png")
-    result = plan("ball_in_cup", timeout=20.0)
-    render(result, OUT / "ball_in_cup_motion.png", (1280, 960))
-    print(OUT / "ball_in_cup_motion.png")
+    for name in ("ball_in_cup", "carry_tray"):
+        render(plan(name, timeout=20.0), OUT / f"{name}_motion.png", (1280, 960))
+        print(OUT / f"{name}_motion.png")
     render(plan(MOVING, timeout=20.0), OUT / "moving.png", (1280, 960))
     print(OUT / "moving.png")
     for name, (planner, params) in BASELINES.items():
