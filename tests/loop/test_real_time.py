@@ -53,8 +53,10 @@ class BadEyes:
         return found[::-1]
 
 
-def go(*faults: str, eyes: type[BadEyes] | None = None) -> tuple[RunRecord, RefereeReport, PlannerProcess]:
-    context = context_of(PROBLEM, speed=0.3, prediction="still", fastest=0.5, timeout=3.0)
+def go(
+    *faults: str, eyes: type[BadEyes] | None = None, timeout: float = 3.0
+) -> tuple[RunRecord, RefereeReport, PlannerProcess]:
+    context = context_of(PROBLEM, speed=0.3, prediction="still", fastest=0.5, timeout=timeout)
     world = world_of(PROBLEM, crossing(setup_of(PROBLEM)))
     work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, faults, 0)
     seen = SensorStream(Sensor(), world, context.settings.watched) if eyes is None else eyes(world)
@@ -92,7 +94,7 @@ def test_a_killed_planner_whose_child_lives_on_is_replaced(monkeypatch: pytest.M
 
 
 def test_a_planner_that_never_answers_ends_defined() -> None:
-    done, report, process = go("never")
+    done, report, process = go("never", timeout=1.5)
     check_defined(done, report, process)
     assert "no answer came in time" in {event.data["why"] for event in done.events if event.kind == "rejected"}
 
@@ -224,6 +226,7 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
                 assert time.monotonic() < started + 60.0
                 reply = process.reply(0.0)
                 spent += [] if reply is None else [reply]
+                time.sleep(0.002)
     assert [one.number for one in spent] in ([1, 2, 3], [1, 3])
     assert all(one.answer.found is not None for one in spent) and spent[-2].answer.budget.spent < 8.0
 
