@@ -90,10 +90,13 @@ def test_every_level_has_problems_of_its_split() -> None:
         constrained.levels_of(["shelf/hard"])
 
 
-def test_grids_give_rows_with_different_labels() -> None:
-    for name in constrained.GRIDS:
-        rows = constrained.grid(name)
-        assert len({row.label for row in rows}) == len(rows) >= 4 and all(row.runner for row in rows)
+def test_all_rivals_have_as_many_candidates_and_the_tuned_one_is_among_them() -> None:
+    rivals = [row for row in constrained.ROWS if "apex" not in row.planner]
+    assert [row.label for row in rivals] == list(constrained.CANDIDATES) == list(constrained.TUNED)
+    for row in rivals:
+        rows = constrained.candidates(row.label)
+        assert len({one.label for one in rows}) == len(rows) == constrained.RUNGS[0][0]
+        assert row.params in [one.params for one in rows] and not rows[0].params
 
 
 def test_the_arms_are_planned_without_the_hands(robot: Robot) -> None:
