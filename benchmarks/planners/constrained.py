@@ -46,6 +46,7 @@ from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.evaluation.summary import Statistics
+from apex_ompl.ompl.parameters import register
 from apex_ompl.problems.catalogue import CONSTRAINED, SPLITS, VALIDATION
 from apex_ompl.result import FIRST, PlanResult
 from apex_ompl.robot import Robot, load_robot
@@ -57,6 +58,7 @@ from apex_ompl.util.statistics import share_interval
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
 from benchmarks.planners.constrained_cbirrt import NAME as BASE
+from benchmarks.planners.constrained_cbirrt import CbirrtParameters
 from benchmarks.planners.constrained_check import DENSE, DenseCheck, dense_check, problem_of
 
 DEPENDS = (
@@ -141,6 +143,7 @@ def checked_motion(robot: Robot, problem: Problem, result: PlanResult) -> DenseC
 
 def plan_with_apex(job: Job) -> Run:
     """Return the columns of a run of ``apex_ompl.plan``, with the dense checks of its path and its motion."""
+    register(BASE)(CbirrtParameters)
     problem, started = problem_of(job), time.process_time()
     result = plan(problem, job.planner, timeout=job.timeout, seed=job.seed, params=dict(job.params))
     cpu, times = time.process_time() - started, dict(result.times)

@@ -19,7 +19,7 @@ from apex_ompl.apex.planner import APEX
 from apex_ompl.apex.stages.constrained import TREES, on_constraints
 from apex_ompl.apex.stages.stage import Solution, Stage
 from apex_ompl.kernel.constraints import ConstrainedTreePair
-from apex_ompl.ompl.parameters import bounded, register
+from apex_ompl.ompl.parameters import bounded
 from apex_ompl.paths.path import SEARCH_RESOLUTION, Path
 
 NAME = "cbirrt"
@@ -61,7 +61,6 @@ class Trees:
         return None
 
 
-@register(NAME)
 @dataclass(frozen=True)
 class CbirrtParameters(ApexParameters):
     """Trees by projection, shortcuts and polish.
