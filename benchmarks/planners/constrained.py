@@ -17,14 +17,15 @@ ignored, ``best`` the least of all rows.
 Each run is stored in benchmarks/runs/constrained when it ends; the command resumes where it was stopped.
 
 ``--motions`` plans each problem with some more seeds, and checks the motions alone.
-``--tune`` tries candidates of a row on validation problems: all on the first of each level, the best two on the second,
-too. The score is the mean time to the first path, an unsolved one counts as twice the limit; for rows that shorten
-their paths, times the mean of the length over the shortest of all candidates, where an unsolved one counts as 2.
+``--tune`` tries candidates of rows on validation problems of every second level, by CPU time: all on the first of each
+level, the best two on the second, too. The score is the mean time to the first path, an unsolved one counts as twice
+the limit; for rows that shorten their paths, times the mean of the length over the shortest of all candidates, where an
+unsolved one counts as 2.
 
 Usage: python -m benchmarks.planners.constrained [SUITE[/LEVEL] ...] [-n 17] [--unseen 67] [--rows NAME ...] [--jobs 1]
        [--clock cpu] [--split validation] [--report]
        python -m benchmarks.planners.constrained --motions 5 [--jobs 1]
-       python -m benchmarks.planners.constrained --tune cbirrt
+       python -m benchmarks.planners.constrained --tune NAME ...
 """
 
 from __future__ import annotations
@@ -345,37 +346,42 @@ def score(runs: Sequence[Run], shortest: Mapping[str, float], *, shortens: bool)
     return float(np.mean(times)) * (float(np.mean(lengths)) if shortens else 1.0)
 
 
-def tune(name: str, levels: Sequence[str], store: Path, workers: Workers) -> None:
-    """Try the candidates of a row on validation problems, and write their scores."""
-    rows, scores = candidates(name), list[dict[str, float]]()
-    results = None
+def tune(names: Sequence[str], levels: Sequence[str], store: Path, workers: Workers) -> None:
+    """Try the candidates of rows on validation problems, and write their scores."""
+    lines = [record.row(["row", "candidate", *(f"score ms on {n} of each level" for _, n in RUNGS), "solved"])]
+    lines.append(record.row(["---", "---", *["---:"] * (len(RUNGS) + 1)]))
+    data = dict[str, dict[str, Any]]()
+    for name in names:
+        results, scores = tuned(name, levels, store, workers)
+        data[name] = {}
+        for label in sorted(scores[0], key=lambda label: [s.get(label, math.inf) for s in scores[::-1]]):
+            runs = [run for run in results if run["label"] == label]
+            count = [sum(run["solved"] for run in runs), len(runs)]
+            data[name][label] = {"scores_s": [s.get(label) for s in scores], "solved": count}
+            lines.append(record.row([name, label, *(_ms(s.get(label)) for s in scores), f"{count[0]} of {count[1]}"]))
+    about = {"limit": f"{TIMEOUT:g} s", "seeds": "0", "clock": "cpu", **record.made_with(Results.load(store))}
+    record.write("constrained_tuning", {"rows": data}, "\n".join(lines), split="validation", **about)
+
+
+def tuned(
+    name: str, levels: Sequence[str], store: Path, workers: Workers
+) -> tuple[list[Run], list[dict[str, float]]]:  # fmt: skip
+    """Run the candidates of a row on validation problems, and return the runs and the scores of each rung."""
+    rows, scores, made = candidates(name), list[dict[str, float]](), dict[str, Run]()
     for keep, count in RUNGS:
-        if scores:
-            order = sorted(rows, key=lambda row: scores[-1][row.label])
-            rows = order[:keep]
+        rows = sorted(rows, key=lambda row: scores[-1][row.label])[:keep] if scores else rows
         ids = [problem for level in levels for problem in problems_of(level, count, tune=True)]
         results = bench(
             ids, rows, store, runs=1, timeout=TIMEOUT, split="validation", workers=workers,
             provenance=record.session(),
         )  # fmt: skip
-        mine = {row.label: runs_of(results, ids, [row]) for row in rows}
+        mine = {row.label: [r for r in runs_of(results, ids, [row]) if r["status"] != NO_PROBLEM] for row in rows}
+        made |= {run["key"]: run for runs in mine.values() for run in runs}
         shortest = dict[str, float]()
         for run in (run for runs in mine.values() for run in runs if run["solved"]):
             shortest[run["problem"]] = min(run["length"], shortest.get(run["problem"], math.inf))
-        possible = {label: [r for r in runs if r["status"] != NO_PROBLEM] for label, runs in mine.items()}
-        scores.append({k: score(runs, shortest, shortens=name in SHORTENS) for k, runs in possible.items()})
-    assert results is not None
-    lines = [record.row(["candidate", *(f"score ms on {n} of each level" for _, n in RUNGS), "solved"])]
-    lines.append(record.row(["---", *["---:"] * (len(RUNGS) + 1)]))
-    data = {}
-    for label in sorted(scores[0], key=lambda label: [s.get(label, math.inf) for s in scores[::-1]]):
-        runs = [run for run in results.runs if run["label"] == label and run["status"] != NO_PROBLEM]
-        solved = f"{sum(run['solved'] for run in runs)} of {len(runs)}"
-        data[label] = {"scores_s": [s.get(label) for s in scores], "solved": solved}
-        lines.append(record.row([label, *(_ms(s.get(label)) for s in scores), solved]))
-    about = {"limit": f"{TIMEOUT:g} s", "seeds": "0", **record.made_with(results)}
-    name = f"constrained_tuning_{name.replace(' ', '_')}"
-    record.write(name, {"candidates": data}, "\n".join(lines), split="validation", clock="CPU", **about)
+        scores.append({label: score(runs, shortest, shortens=name in SHORTENS) for label, runs in mine.items()})
+    return list(made.values()), scores
 
 
 def runs_of(results: Results, ids: Iterable[str], rows: Iterable[Row]) -> list[Run]:
@@ -435,7 +441,9 @@ def parser() -> argparse.ArgumentParser:
     )
     names = [row.label for row in ROWS]
     found.add_argument("--rows", nargs="*", choices=names, default=names, metavar="NAME", help="(default: all)")
-    found.add_argument("--tune", choices=CANDIDATES, metavar="NAME", help="try candidates of a row, by CPU time")
+    found.add_argument(
+        "--tune", nargs="+", choices=CANDIDATES, metavar="NAME", help="try candidates of rows, by CPU time"
+    )
     found.add_argument("--motions", type=one_or_more, metavar="SEEDS", help="check motions of apex with several seeds")
     found.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="time that limits and times are")
     found.add_argument("--split", choices=("test", "validation"), default="test", help="(default: %(default)s)")
@@ -447,16 +455,15 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Run what is missing, and write the results."""
     args = parser().parse_args()
-    levels, tuned = levels_of(args.levels), args.split == "validation"
+    levels, validation = levels_of(args.levels), args.split == "validation"
     modules = (CLOCK,) if args.clock == "cpu" or args.tune else ()
     workers = Workers(args.jobs, modules=modules)
     if args.tune:
-        rows = available([row for row in ROWS if row.label == args.tune])
-        if rows:
-            tune(args.tune, levels, args.store.with_name(f"{args.store.name}_tuning"), workers)
+        names = [row.label for row in available([row for row in ROWS if row.label in args.tune])]
+        tune(names, levels[::2], args.store.with_name(f"{args.store.name}_tuning"), workers)
         return
     per_level = {level: args.unseen if level.startswith("unseen/") else args.n for level in levels}
-    by_level = [problems_of(level, count, tune=tuned) for level, count in per_level.items()]
+    by_level = [problems_of(level, count, tune=validation) for level, count in per_level.items()]
     ids = [problem for some in by_level for problem in some]
     about = {"split": args.split, "clock": args.clock}
     name = "_".join([args.store.name, *([] if args.split == "test" else [args.split])])
