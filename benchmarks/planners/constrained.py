@@ -4,7 +4,7 @@ Problems: the levels ``tray``, ``level`` and ``cups`` of the suites (test split)
 the first ones, on which rivals are tuned). Rows: apex; apex without network; line + LM, which is the straight line and
 its optimization under constraints; cbirrt, this project's trees with shortcuts and polish; OMPL's constrained spaces
 with RRTConnect; sscbirrt and RoboPlan, where they are installed. Rivals have the same problems and time limit, and
-their tuned parameters; slow ones have every second problem. All but RoboPlan use this project's collision checker and
+their tuned parameters. All but RoboPlan use this project's collision checker and
 its compiled projection.
 
 A run is solved where a path came within the limit, and passed the row's own check and an independent one: constraints
@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import itertools
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -104,7 +105,6 @@ ROWS = (
     Row("sscbirrt", "sscbirrt", TUNED["sscbirrt"], runner=SSCBIRRT),
     Row("roboplan", "roboplan", TUNED["roboplan"], runner=ROBOPLAN),
 )
-SLOW = ("ompl tangent bundle", "sscbirrt")  # rows that have every second problem of a level
 SHORTENS = (BASE, "ompl projected", "ompl atlas", "ompl tangent bundle")
 CHARTS = (
     {}, {"delta": 0.2}, {"delta": 0.1, "rho": 0.5}, {"delta": 0.2, "rho": 0.5}, {"delta": 0.2, "rho": 1.0},
@@ -464,22 +464,18 @@ def main() -> None:
         return
     per_level = {level: args.unseen if level.startswith("unseen/") else args.n for level in levels}
     by_level = [problems_of(level, count, tune=validation) for level, count in per_level.items()]
-    ids = [problem for some in by_level for problem in some]
-    about = {"split": args.split, "clock": args.clock}
+    ids = [problem for some in itertools.zip_longest(*by_level) for problem in some if problem]
     name = "_".join([args.store.name, *([] if args.split == "test" else [args.split])])
     if args.motions:
         write_motions(args.motions, ids, args.store.with_name(f"{name}_motions"), workers, args.split)
         return
     store = args.store.with_name("_".join([name, *([] if args.clock == "wall" else [args.clock])]))
     rows = available([row for row in ROWS if row.label in args.rows])
-    half = [problem for some in by_level for problem in some[::2]]
-    own = [row for row in rows if row.runner == OWN]
-    others = [row for row in rows if row.runner != OWN and row.label not in SLOW]
-    slow = [row for row in rows if row.label in SLOW]
-    for some, which in ((own, ids), (others, ids), (slow, half)):
+    own, rivals = ([row for row in rows if (row.runner == OWN) is ours] for ours in (True, False))
+    for some in (own, rivals):  # so that a run that is stopped has those of this project
         if some and not args.report:
             bench(
-                which, some, store, runs=1, timeout=TIMEOUT, split=args.split, workers=workers,
+                ids, some, store, runs=1, timeout=TIMEOUT, split=args.split, workers=workers,
                 provenance=record.session(),
             )  # fmt: skip
     results = Results.load(store)
