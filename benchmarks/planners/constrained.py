@@ -299,7 +299,9 @@ def tabulate(results: Results, rows: Sequence[Row]) -> tuple[dict[str, Any], str
     pairs, table = paired(runs, rows)
     left_out = sorted({run["reason"] for run in runs if run["status"] == NO_PROBLEM})
     notes = [f"Left out: problems where {'; '.join(left_out)}."] if left_out else []
-    return {"groups": found, "pairs": pairs}, "\n\n".join(["\n".join(lines), *notes, table])
+    unsolved = sorted({run["problem"] for run in runs} - {run["problem"] for run in runs if run["solved"]})
+    notes += [f"Solved by no row: {', '.join(unsolved) or 'none'}."]
+    return {"groups": found, "pairs": pairs, "unsolved": unsolved}, "\n\n".join(["\n".join(lines), *notes, table])
 
 
 def paired(runs: Sequence[Run], rows: Sequence[Row]) -> tuple[dict[str, Any], str]:

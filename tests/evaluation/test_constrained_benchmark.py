@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from support import benchmark_script
+from support import ROOT, benchmark_script
 
 from apex_ompl import problems
 from apex_ompl.errors import ApexError, UnknownNameError
-from apex_ompl.evaluation import Results
+from apex_ompl.evaluation import Results, Row
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.ompl.parameters import REGISTRY
 from apex_ompl.problems.catalogue import CONSTRAINED
@@ -105,6 +105,16 @@ def test_all_rivals_have_as_many_candidates_and_the_tuned_one_is_among_them() ->
         assert row.params in [one.params for one in rows] and not rows[0].params
 
 
+def test_tuned_parameters_are_those_of_the_least_score() -> None:
+    written = json.loads((ROOT / "benchmarks" / "results" / "constrained_tuning.json").read_text())
+    assert written["about"]["split"] == "validation" and set(written["rows"]) == set(constrained.TUNED)
+    for row in constrained.ROWS:
+        if row.label in constrained.TUNED:
+            last = {label: one["scores_s"][-1] for label, one in written["rows"][row.label].items()}
+            chosen = min((score, label) for label, score in last.items() if score is not None)[1]
+            assert Row.of(row.planner, constrained.TUNED[row.label]).label == chosen
+
+
 def job(label: str, problem: str, **params: Any) -> Job:
     row = next(row for row in constrained.ROWS if row.label == label)
     return Job("", problem, label, row.planner, {**row.params, **params}, 0, 10.0, True, row.runner)
@@ -146,7 +156,7 @@ def test_tables_compare_rows_on_the_same_problems(tmp_path: Path) -> None:
     assert (rival["n"], rival["left_out"], rival["solved"]) == (1, 1, 1.0)
     assert found["pairs"]["suites, roboplan"]["first_s"][0] == [0.4, 0.1]
     assert found["pairs"]["suites, cbirrt"]["solved"] == [1, 2]
-    assert "shapes that RoboPlan has not" in table and "unseen" not in found["groups"]
+    assert found["unsolved"] == [] and "shapes that RoboPlan has not" in table and "unseen" not in found["groups"]
 
 
 def test_scores_count_unsolved_problems_twice() -> None:
