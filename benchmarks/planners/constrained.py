@@ -86,12 +86,12 @@ PACKAGES = {SSCBIRRT: "sscbirrt", ROBOPLAN: "roboplan"}
 NO_PROPOSALS = {"model": "none", "first": 0, "second": 0, "third": 0, "resample": 0}
 APEX = "apex"
 TUNED: Mapping[str, Mapping[str, Any]] = {
-    BASE: {},
-    "ompl projected": {},
-    "ompl atlas": {},
-    "ompl tangent bundle": {},
-    "sscbirrt": {},
-    "roboplan": {},
+    BASE: {"longest": 0.3},
+    "ompl projected": {"delta": 0.1, "stretch": 4.0, "range": 1.0},
+    "ompl atlas": {"delta": 0.2, "rho": 0.5, "range": 1.5},
+    "ompl tangent bundle": {"delta": 0.1, "rho": 0.5},
+    "sscbirrt": {"step_size": 0.3, "extend_steps": 3},
+    "roboplan": {"max_connection_distance": 1.5},
 }
 """Row -> the parameters that ``--tune`` chose."""
 ROWS = (
