@@ -37,6 +37,7 @@ import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -485,6 +486,7 @@ def main() -> None:
     data, table = tabulate(results, rows)
     about = {"split": _split(args.split), "limit": f"{TIMEOUT:g} s", "clock": args.clock, "seeds": "0"}
     about |= {"tuned": "; ".join(f"{label} {dict(params)}" for label, params in TUNED.items())}
+    about |= {PACKAGES[row.runner]: version(PACKAGES[row.runner]) for row in rows if row.runner in PACKAGES}
     record.write(name, data, table, **about, **record.made_with(results))
 
 
