@@ -33,10 +33,11 @@ DENSE = SEARCH_RESOLUTION / 20.0  # spacing of the states of the check [rad, max
 REFINED = 0.01  # of those of a rival's path after refinement [rad, max-norm]
 SLACK = 1e-9  # by which a violation may pass its tolerance, for rounding [m, rad]
 
+LATE = 1.1  # times the limit, until which a rival's path counts: rivals look at the clock from time to time
 WARM_UP = "carry_tray"  # problem of the runs that load code
 
-Residual = Callable[[Mapping[str, Array]], float]
-"""Distance or angle from what is wanted, over its tolerance, by the poses of frames."""
+Residual = Callable[[Mapping[str, Array]], Array]
+"""Distance or angle from what is wanted, over its tolerance, shape (...), by the poses of frames, shape (..., 4, 4)."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +66,36 @@ class FrameReader:
         """Prepare for the frames that constraints of the problem name."""
         self.robot, self._data = robot, robot.model.createData()
         self._held = {body.name: body for body in problem.attached}
-        self._frames: dict[str, tuple[int, Array]] = {}
 
-    def __call__(self, q: Array, names: tuple[str, ...]) -> dict[str, Array]:
-        """Return the poses in the world of frames at a state, shape (4, 4) each [m]."""
-        pin.framesForwardKinematics(self.robot.model, self._data, self.robot.to_pinocchio(q))
-        found = {}
-        for name in names:
-            if name not in self._frames:
-                frame = frame_of(self.robot, name, self._held)
-                self._frames[name] = (self.robot.link_frame(frame.link), frame.pose)
-            number, pose = self._frames[name]
-            found[name] = self._data.oMf[number].homogeneous @ pose
-        found[WORLD] = np.eye(4)
-        return found
+    def __call__(self, states: Array, names: tuple[str, ...]) -> dict[str, Array]:
+        """Return the poses in the world of frames at states, shape (..., dof); shape (..., 4, 4) each [m]."""
+        model, data, rows = self.robot.model, self._data, np.atleast_2d(states)
+        frames = [frame_of(self.robot, name, self._held) for name in names]
+        numbers = [self.robot.link_frame(frame.link) for frame in frames]
+        found = np.empty((len(names), len(rows), 4, 4))
+        for k, q in enumerate(rows):
+            pin.forwardKinematics(model, data, self.robot.to_pinocchio(q))
+            for n, number in enumerate(numbers):
+                found[n, k] = pin.updateFramePlacement(model, data, number).homogeneous
+        shape = (*np.shape(states)[:-1], 4, 4)
+        poses = {
+            name: (found[n] @ frame.pose).reshape(shape)
+            for n, (name, frame) in enumerate(zip(names, frames, strict=True))
+        }
+        return {**poses, WORLD: np.broadcast_to(np.eye(4), shape)}
 
 
-def _turned(first: Array, second: Array) -> float:
-    return float(np.linalg.norm(pin.log3(first[:3, :3].T @ second[:3, :3])))
+def _turned(first: Array, second: Array) -> Array:
+    """Return the angles between orientations, shape (...) [rad]."""
+    turn = np.swapaxes(first[..., :3, :3], -1, -2) @ second[..., :3, :3]
+    skew = turn - np.swapaxes(turn, -1, -2)
+    sine = np.linalg.norm(skew[..., (2, 0, 1), (1, 2, 0)], axis=-1)
+    return np.arctan2(sine, np.trace(turn, axis1=-2, axis2=-1) - 1.0)
 
 
-def _angle(first: Array, second: Array) -> float:
-    return float(np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second))
+def _angle(first: Array, second: Array) -> Array:
+    """Return the angles between vectors, shape (...) [rad]."""
+    return np.arctan2(np.linalg.norm(np.cross(first, second), axis=-1), (first * second).sum(axis=-1))
 
 
 def _unit(vector: Any) -> Array:
@@ -96,15 +105,19 @@ def _unit(vector: Any) -> Array:
 def _region(constraint: ToolRegion) -> Residual:
     origin = pose_matrix(constraint.position, constraint.orientation)
 
-    def worst(poses: Mapping[str, Array]) -> float:
+    def worst(poses: Mapping[str, Array]) -> Array:
         found = np.linalg.inv(origin) @ poses[constraint.frame]
-        off = 0.0 if constraint.angle is None else _turned(np.eye(4), found) / constraint.angle
-        for value, low, high in zip(found[:3, 3], constraint.lower, constraint.upper, strict=True):
+        off = np.zeros(found.shape[:-2])
+        if constraint.angle is not None:
+            off = _turned(np.eye(4), found) / constraint.angle
+        for k, (low, high) in enumerate(zip(constraint.lower, constraint.upper, strict=True)):
+            value = found[..., k, 3]
             if low is not None and high is not None:
-                off = max(off, abs(value - (low + high) / 2.0) / ((high - low) / 2.0))
-            elif (low is not None and value < low) or (high is not None and value > high):
-                off = np.inf
-        return float(off)
+                off = np.maximum(off, abs(value - (low + high) / 2.0) / ((high - low) / 2.0))
+            else:
+                outside = value < low if low is not None else value > high if high is not None else False
+                off = np.where(outside, np.inf, off)
+        return off
 
     return worst
 
@@ -127,7 +140,7 @@ def residual_of(constraint: Any, start: Mapping[str, Array]) -> Residual:
     """
     if isinstance(constraint, Upright):
         axis, up = _unit(constraint.axis), _unit(constraint.up)
-        return lambda p: _angle(p[constraint.frame][:3, :3] @ axis, up) / constraint.angle
+        return lambda p: _angle(p[constraint.frame][..., :3, :3] @ axis, up) / constraint.angle
     if isinstance(constraint, RelativePose):
         return _relative(constraint, start)
     if isinstance(constraint, OnPlane | OnLine):
@@ -135,10 +148,11 @@ def residual_of(constraint: Any, start: Mapping[str, Array]) -> Residual:
         origin = start[name][:3, 3].copy() if constraint.point is None else np.array(constraint.point)
         along = _unit(constraint.normal if isinstance(constraint, OnPlane) else constraint.direction)
 
-        def distance(poses: Mapping[str, Array]) -> float:
-            offset = poses[name][:3, 3] - origin
-            off = along @ offset if isinstance(constraint, OnPlane) else np.linalg.norm(np.cross(along, offset))
-            return float(abs(off)) / constraint.tolerance
+        def distance(poses: Mapping[str, Array]) -> Array:
+            offset = poses[name][..., :3, 3] - origin
+            on_line = isinstance(constraint, OnLine)
+            off = np.linalg.norm(np.cross(along, offset), axis=-1) if on_line else abs(offset @ along)
+            return np.asarray(off / constraint.tolerance)
 
         return distance
     if isinstance(constraint, FixedOrientation):
@@ -159,15 +173,15 @@ def _relative(constraint: RelativePose, start: Mapping[str, Array]) -> Residual:
     kept = [k for k, name in enumerate("xyz") if name not in constraint.free]
     turns = [name for name in constraint.free if name.startswith("r")]
 
-    def worst(poses: Mapping[str, Array]) -> float:
+    def worst(poses: Mapping[str, Array]) -> Array:
         found = np.linalg.inv(poses[first]) @ poses[second]
-        off = float(np.linalg.norm((found - wanted)[kept, 3])) / tolerance.position
+        off = np.linalg.norm((found - wanted)[..., kept, 3], axis=-1) / tolerance.position
         if len(turns) == 3:
-            return off
+            return np.asarray(off)
         if len(turns) == 1:
             k = "xyz".index(turns[0][1])
-            return max(off, _angle(found[:3, k], wanted[:3, k]) / tolerance.angle)
-        return max(off, _turned(wanted, found) / tolerance.angle)
+            return np.maximum(off, _angle(found[..., :3, k], wanted[:3, k]) / tolerance.angle)
+        return np.maximum(off, _turned(wanted, found) / tolerance.angle)
 
     return worst
 
@@ -208,10 +222,8 @@ def dense_check(robot: Robot, problem: Problem, path: Array, spacing: float = DE
     names = tuple(dict.fromkeys(name for one in constraints for name in frames_of(one)))
     at_start = reader(problem.start_state(robot.joint_names), names)
     residuals = [residual_of(one, at_start) for one in constraints]
-    worst = 0.0
-    for q in states:
-        poses = reader(q, names)
-        worst = max([worst, *(residual(poses) for residual in residuals)])
+    poses = reader(states, names)
+    worst = max((float(residual(poses).max()) for residual in residuals), default=0.0)
     checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
     return DenseCheck(len(states), worst, bool(checker.are_free(states).all()))
 
@@ -229,7 +241,8 @@ def refined(constraints: ConstraintSet, path: Array, spacing: float = REFINED) -
 
 
 def columns(
-    ready: PlanningSetup, constraints: ConstraintSet, paths: Sequence[Array], times: dict[str, float], reason: str = ""
+    ready: PlanningSetup, constraints: ConstraintSet, paths: Sequence[Array], times: dict[str, float], *, limit: float,
+    reason: str = "",
 ) -> dict[str, Any]:  # fmt: skip
     """Return the columns of a rival's run.
 
@@ -239,9 +252,12 @@ def columns(
         paths: The final path, shape (N, dof), then that before simplification, which is tried where the final one fails
             the check; none where none was found.
         times: Times of the stages [s]; ``solve`` and ``simplify`` make up the run.
+        limit: Latest end of ``solve`` for which a path counts [s].
         reason: Why there is no path.
     """
     found, check = None, None
+    if times["solve"] > LATE * limit:
+        paths, reason = (), reason or "the path came late"
     for states in paths:
         if found is not None:
             break
@@ -254,7 +270,7 @@ def columns(
     total = times.get("solve", 0.0) + times.get("simplify", 0.0)
     return {
         "solved": found is not None, "first": times["solve"] if found is not None else None, "total": total,
-        "times": times, "length": None if found is None else path_length(found), "reason": reason,
+        "cpu": total, "times": times, "length": None if found is None else path_length(found), "reason": reason,
         "failed_check": len(paths) > 0 and found is None,
         "violation": None if check is None else check.violation,
     }  # fmt: skip

@@ -200,14 +200,14 @@ def _solved(
     with timed(times, "solve"):
         status = simple.solve(ob.PlannerTerminationCondition(lambda: time.perf_counter() > until)).getStatus()
     if status != ob.PlannerStatus.PlannerStatusType.EXACT_SOLUTION:
-        return columns(ready, constraints, (), times, str(status.name))
+        return columns(ready, constraints, (), times, limit=job.timeout, reason=str(status.name))
     paths = [_states(ready, simple)]
     left = min(until - time.perf_counter(), share * job.timeout)
     if left > 0.0:
         with timed(times, "simplify"):
             simple.simplifySolution(left)
         paths.insert(0, _states(ready, simple))
-    return columns(ready, constraints, paths, times)
+    return columns(ready, constraints, paths, times, limit=job.timeout)
 
 
 def _states(ready: PlanningSetup, simple: og.SimpleSetup) -> Array:

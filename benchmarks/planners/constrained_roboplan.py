@@ -8,6 +8,7 @@ as they are.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from dataclasses import replace as replaced
@@ -35,6 +36,7 @@ RUNNER = f"{__name__}:plan_with_roboplan"
 GROUP = "arms"
 WIDE = 100.0  # bound of what is free [m or rad]
 ANGLE = 0.005  # default tolerance of angles beyond their bounds [rad]
+PATIENCE = 4.0  # of its clock, times the limit, where CPU times count: later paths do not
 PROJECTION = ("path_step_size", "max_iters", "correction_step_size", "damping", "convergence_ratio")
 
 
@@ -131,8 +133,9 @@ def plan_with_roboplan(job: Job) -> Run:
     ]  # fmt: skip
     projection = {name: value for name, value in job.params.items() if name in PROJECTION}
     rest = {name: value for name, value in job.params.items() if name not in PROJECTION}
+    patience = PATIENCE if time.perf_counter is time.process_time else 1.0
     options = RRTOptions(
-        group_name=GROUP, max_nodes=NODES, max_planning_time=job.timeout, rrt_connect=True,
+        group_name=GROUP, max_nodes=NODES, max_planning_time=patience * job.timeout, rrt_connect=True,
         constraint_projection=ConstraintProjectorOptions(**projection),
         **{"collision_check_step_size": SEARCH_RESOLUTION, **rest},
     )  # fmt: skip
@@ -145,12 +148,12 @@ def plan_with_roboplan(job: Job) -> Run:
         with timed(times, "solve"):
             path = planner.plan(start, goal, rules)
     except RuntimeError as error:
-        return columns(ready, constraints, (), times, str(error)[:80])
+        return columns(ready, constraints, (), times, limit=job.timeout, reason=str(error)[:80])
     order = [list(path.joint_names).index(name) for name in names]
     states = np.repeat(ready.start[None], len(path.positions), axis=0)
     states[:, joints] = np.array(path.positions)[:, order]
     states[0], states[-1] = ready.start, ready.goals[0]
-    return columns(ready, constraints, [states], times)
+    return columns(ready, constraints, [states], times, limit=job.timeout)
 
 
 def scene_links(ready: PlanningSetup) -> set[str]:

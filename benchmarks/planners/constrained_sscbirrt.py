@@ -6,6 +6,7 @@ compiled code. Start and goal are single states; only the joints of the arms are
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.clocks import timed
 from benchmarks.planners.constrained_check import arm_joints, columns, problem_of
 
+PATIENCE = 10.0  # of the package's own clock, times the limit, which ``abort_fn`` keeps
 RUNNER = f"{__name__}:plan_with_sscbirrt"
 
 
@@ -67,7 +69,11 @@ def plan_with_sscbirrt(job: Job) -> Run:
     constraints = ConstraintSet.of(ready.robot, ready.problem.constraints, ready.problem.attached, ready.start)
     joints = arm_joints(ready)
     arms = Arms(ready, joints)
-    config = CBiRRTConfig(timeout=job.timeout, max_iterations=2**31 - 1, **{"smooth_path": False, **job.params})
+    until = time.perf_counter() + job.timeout
+    config = CBiRRTConfig(
+        timeout=PATIENCE * job.timeout, max_iterations=2**31 - 1, abort_fn=lambda: time.perf_counter() > until,
+        **{"smooth_path": False, **job.params},
+    )  # fmt: skip
     planner = CBiRRT(arms, None, arms, config)
     start, goal = (FiniteSet([q[joints]], metric=planner.space.distance) for q in (ready.start, ready.goals[0]))
     manifold = Manifold(constraints, joints, ready.start)
@@ -76,8 +82,8 @@ def plan_with_sscbirrt(job: Job) -> Run:
     with timed(times, "solve"):
         found: Any = planner.solve(problem, seed=job.seed)
     if found.path is None:
-        return columns(ready, constraints, (), times, str(found.failure_reason)[:80])
+        return columns(ready, constraints, (), times, limit=job.timeout, reason=str(found.failure_reason)[:80])
     states = np.repeat(ready.start[None], len(found.path), axis=0)
     states[:, joints] = np.array(found.path)
     states[0], states[-1] = ready.start, ready.goals[0]
-    return columns(ready, constraints, [states], times)
+    return columns(ready, constraints, [states], times, limit=job.timeout)

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from support import benchmark_script
+from support import ROOT, benchmark_script
 
 from apex_ompl import problems
 from apex_ompl.errors import ApexError, UnknownNameError
+from apex_ompl.evaluation import Results, Row
+from apex_ompl.evaluation.rows import Job
+from apex_ompl.ompl.parameters import REGISTRY
 from apex_ompl.problems.catalogue import CONSTRAINED
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import pose_matrix
@@ -90,10 +96,79 @@ def test_every_level_has_problems_of_its_split() -> None:
         constrained.levels_of(["shelf/hard"])
 
 
-def test_grids_give_rows_with_different_labels() -> None:
-    for name in constrained.GRIDS:
-        rows = constrained.grid(name)
-        assert len({row.label for row in rows}) == len(rows) >= 4 and all(row.runner for row in rows)
+def test_all_rivals_have_as_many_candidates_and_the_tuned_one_is_among_them() -> None:
+    rivals = [row for row in constrained.ROWS if "apex" not in row.planner]
+    assert [row.label for row in rivals] == list(constrained.CANDIDATES) == list(constrained.TUNED)
+    for row in rivals:
+        rows = constrained.candidates(row.label)
+        assert len({one.label for one in rows}) == len(rows) == constrained.RUNGS[0][0]
+        assert row.params in [one.params for one in rows] and not rows[0].params
+
+
+def test_tuned_parameters_are_those_of_the_least_score() -> None:
+    written = json.loads((ROOT / "benchmarks" / "results" / "constrained_tuning.json").read_text())
+    assert written["about"]["split"] == "validation" and set(written["rows"]) == set(constrained.TUNED)
+    for row in constrained.ROWS:
+        if row.label in constrained.TUNED:
+            last = {label: one["scores_s"][-1] for label, one in written["rows"][row.label].items()}
+            chosen = min((score, label) for label, score in last.items() if score is not None)[1]
+            assert Row.of(row.planner, constrained.TUNED[row.label]).label == chosen
+
+
+def job(label: str, problem: str, **params: Any) -> Job:
+    row = next(row for row in constrained.ROWS if row.label == label)
+    return Job("", problem, label, row.planner, {**row.params, **params}, 0, 10.0, True, row.runner)
+
+
+def test_runs_of_apex_and_cbirrt_have_paths_and_motions_that_passed_the_dense_check(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(REGISTRY, "cbirrt", constrained.CbirrtParameters)  # and out of it again
+    for label in ("apex without network", "cbirrt"):
+        run = constrained.plan_with_apex(job(label, "wall/tray/800000"))
+        assert run["solved"] and not run["failed_check"] and 0.0 < run["violation"] < 1.0, run["reason"]
+        assert 0.0 < run["first"] < run["total"] and run["duration"] >= run["direct"] > 0.0
+    assert run["by"] == "trees on constraints"
+    motions = constrained.motions_of_apex(job("apex without network", "wall/tray/800000", seeds=2))
+    assert len(motions["violations"]) == 2 and not motions["faults"] and max(motions["violations"]) < 1.0
+
+
+def run_of(label: str, problem: str, first: float | None, length: float = 2.0, **more: Any) -> dict[str, Any]:
+    return {
+        "label": label, "problem": problem, "solved": first is not None, "first": first, "total": first,
+        "cpu": 0.5, "length": None if first is None else length, "failed_check": False, "violation": 0.5,
+        "status": "", "reason": "", **more,
+    }  # fmt: skip
+
+
+def test_tables_compare_rows_on_the_same_problems(tmp_path: Path) -> None:
+    a, b = "shelf/tray/900000", "wall/tray/900000"
+    runs = [
+        run_of("apex", a, 0.1, 3.0, duration=1.1, direct=1.0), run_of("apex", b, 0.3, duration=1.2, direct=1.0),
+        run_of("cbirrt", a, 0.2, 4.0, duration=1.0, direct=1.0), run_of("cbirrt", b, None),
+        run_of("roboplan", a, 0.4, 6.0),
+        run_of("roboplan", b, None, status="NO_PROBLEM", reason="it has shapes that RoboPlan has not"),
+    ]  # fmt: skip
+    found, table = constrained.tabulate(Results(tmp_path, {}, runs), constrained.ROWS)
+    apex, rival = found["groups"]["suites, apex"], found["groups"]["suites, roboplan"]
+    assert apex["n"] == 2 and apex["first_s"] == [0.1, 0.3] and apex["pairs"] == 1
+    assert apex["length_ratio"] == pytest.approx(0.75) and apex["duration_over_best"][0] == pytest.approx(1.05)
+    assert (rival["n"], rival["left_out"], rival["solved"]) == (1, 1, 1.0)
+    assert found["pairs"]["suites, roboplan"]["first_s"][0] == [0.4, 0.1]
+    assert found["pairs"]["suites, cbirrt"]["solved"] == [1, 2]
+    assert found["unsolved"] == [] and "shapes that RoboPlan has not" in table and "unseen" not in found["groups"]
+
+
+def test_scores_count_unsolved_problems_twice() -> None:
+    runs = [run_of("x", "a", 0.2, 3.0), run_of("x", "b", None)]
+    assert constrained.score(runs, {"a": 2.0}, shortens=False) == pytest.approx(1.1)
+    assert constrained.score(runs, {"a": 2.0}, shortens=True) == pytest.approx(1.1 * 1.75)
+
+
+def test_the_clock_of_a_benchmark_on_a_busy_machine_leaves_out_sleep() -> None:
+    code = "import time, benchmarks.planners.constrained_clock; s = time.perf_counter(); time.sleep(0.5)\n"
+    code += "assert time.perf_counter() - s < 0.4"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(constrained.__file__).parents[2])
 
 
 def test_the_arms_are_planned_without_the_hands(robot: Robot) -> None:

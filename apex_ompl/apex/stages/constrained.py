@@ -114,7 +114,8 @@ class ConstrainedProposals:
         return None
 
 
-ITERATIONS, GROWTH = 512, 1.5  # of trees in the first turn, and factor from turn to turn
+ITERATIONS, GROWTH = 2048, 1.5  # of trees in the first turn, and factor from turn to turn
+BETWEEN_TREES = 4  # most proposals in a turn that has trees, since each takes as long as some 500 iterations of them
 TEMPERATURES = (1.0, 1.6, 2.0)  # of proposals in one turn after the other
 
 
@@ -124,7 +125,7 @@ class ConstrainedTurns:
 
     Attributes:
         trees: Whether there are trees.
-        count: Number of proposals in a turn.
+        count: Largest number of proposals in a turn.
     """
 
     trees: bool
@@ -139,7 +140,8 @@ class ConstrainedTurns:
             if self.trees:
                 stages.append(ConstrainedTrees(round(ITERATIONS * GROWTH**turn)))
             if self.count:
-                stages.append(ConstrainedProposals(self.count, TEMPERATURES[turn % len(TEMPERATURES)]))
+                most = BETWEEN_TREES if self.trees else self.count
+                stages.append(ConstrainedProposals(min(most, self.count), TEMPERATURES[turn % len(TEMPERATURES)]))
             for stage in stages:
                 found = stage.run(context)
                 if found is not None:
