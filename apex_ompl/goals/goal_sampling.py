@@ -247,12 +247,12 @@ class _Search:
         """Return states moved within the goal towards the start, for each power, shape (N, dof) each."""
         found = list[Array]()
         for power, weight in zip(POWERS, WEIGHTS, strict=True):
+            if not len(states):
+                break
             durations = self.durations(states)
             states = states[np.argsort(durations, kind="stable")[: max(int(KEPT * len(states)), 1)]]
             ends = self.goal.inverse.approach(states, self.start, self._reach(states), power, weight=weight)
             states = self.returned(ends.states)
-            if not len(states):
-                break
             found.append(states)
         return found
 
