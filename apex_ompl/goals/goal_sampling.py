@@ -3,7 +3,8 @@
 Inverse kinematics descends from states around the start, near and far. Each state found is moved within the goal to
 where its direct motion from the start is fastest, locally (:meth:`apex_ompl.kernel.IKSolver.approach`). As that knows
 no obstacles, the nearest free states are then improved by random search: perturbed, pulled towards the start, brought
-back to the goal, and kept where they are free and nearer.
+back to the goal, and kept where they are free and nearer. Parts of a goal that share no joint, as poses of two hands,
+are combined from different descents. Where free states are much farther than colliding ones, all this is done twice.
 """
 
 from __future__ import annotations
