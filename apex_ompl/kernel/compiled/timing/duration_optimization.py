@@ -333,11 +333,11 @@ class Ends(NamedTuple):
 
     Attributes:
         starts: Number of those at the start.
-        count: Number of all.
+        total: Number of all.
     """
 
     starts: int
-    count: int
+    total: int
 
 
 @reassociating_inlined
@@ -355,7 +355,7 @@ def _margin_of(key: int, margin: float, near_start: float, near_goal: float, end
     own, at = margin, _place_of(key, b.end_key, 0, ends.starts)
     if at >= 0:
         own = min(own, margin - near_start * (margin + END_ROOM - b.end_clearance[at]))
-    at = _place_of(key, b.end_key, ends.starts, ends.count)
+    at = _place_of(key, b.end_key, ends.starts, ends.total)
     if at >= 0:
         own = min(own, margin - near_goal * (margin + END_ROOM - b.end_clearance[at]))
     return own
