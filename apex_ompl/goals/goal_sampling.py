@@ -3,17 +3,20 @@
 Inverse kinematics descends from states around the start, near and far. Each state found is moved within the goal to
 where its direct motion from the start is fastest, locally (:meth:`apex_ompl.kernel.IKSolver.approach`). As that knows
 no obstacles, the nearest free states are then improved by random search: perturbed, pulled towards the start, brought
-back to the goal, and kept where they are free and nearer.
+back to the goal, and kept where they are free and nearer. Parts of a goal that share no joint, as poses of two hands,
+are combined from different descents. Where free states are much farther than colliding ones, all this is done twice.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.alignment import within
@@ -26,7 +29,9 @@ if TYPE_CHECKING:
     from apex_ompl.constraints.constraint_set import ConstraintSet
 
 BATCH = 32  # descents at once
-FEW = 64  # descents after which one free state is enough
+FEW = 64  # descents of a search, more only until one free state is found
+SEARCHES = 2  # one after the other, at most
+ENOUGH = 1.15  # ratio of durations, to free states over to any, up to which one search is enough
 FARTHEST = 1.2  # largest standard deviation of states around the start [rad]
 HOME_SPREAD = 0.6  # standard deviation of states around home [rad]
 TOLERANCE = 1e-6  # norm of the residual at which a descent stops
@@ -44,10 +49,11 @@ KEPT_CLEAR, CLOSE = 0.005, 0.1  # clearance that states keep [m], and share of t
 MARGIN = 0.05  # clearance that is enough [m]
 CLEARING_ROUNDS = 12  # of random search for a free state
 CHILDREN = 16  # states of a round of random search
+MIXED = 4  # states of which the joints of a part of the goal are taken
 MOST_ROUNDS = 20  # of random search
-LOWER, PATIENCE = 0.99, 5  # ratio of costs, and rounds after which it ends without one lower by it
+LOWER, PATIENCE = 0.99, 4  # ratio of costs, and rounds after which it ends without one lower by it
 LOG_SPREADS = math.log(0.02), math.log(0.3)  # of the standard deviation of perturbations, as a share of reaches
-ALONG = np.array([0.3, 0.5, 0.65, 0.8, 0.9])  # states along a line, as shares of it
+ALONG = np.array([0.4, 0.65, 0.88])  # states along a line, as shares of it
 DETOUR, DEPTH = 0.6, 0.005  # largest share that a blocked line adds to a duration, and depth for half of it [m]
 SHORTEST = 0.05  # least duration for which the reach is computed [s]
 PULL = 0.3  # largest share of the way to the start
@@ -123,37 +129,23 @@ def sample(
         max_attempts: Most descents from random states.
     """
     search = _Search(goal, checker, rng)
-    attempts = converged = 0
-    best: Mapping[str, float] = {}
     near = others = np.empty((0, checker.robot.dof))
-    while attempts < max_attempts and (
-        not len(near) or attempts < FEW and (len(near) < min(count, NEAREST) or converged < count)
-    ):
-        states = search.first_states(min(BATCH, max_attempts - attempts), around_home=attempts > 0)
-        ends = search.descended(states, DESCENT_STEPS)
-        attempts += len(states)
-        errors = goal.errors(ends.states[int(np.argmin(ends.errors))])
-        if not best or relative_error(errors, goal.bounds) < relative_error(best, goal.bounds):
-            best = errors
-        reached = search.reached(ends)
-        converged += len(reached)
-        others = np.concatenate([others, reached])
-        if len(search.nearest(others, 1, APART)):
-            found = np.concatenate([near, reached, *search.approached(reached)])
-        else:
-            found = others = np.concatenate([others, search.cleared(reached)])
-        near = search.nearest(found, min(count, NEAREST), NEAR)
+    for _ in range(SEARCHES):
+        found, reached = search.found(count, max_attempts)
+        near, others = search.best_of(np.concatenate([near, found])), np.concatenate([others, reached])
+        if not len(near) or search.durations(near).min() <= ENOUGH * search.least:
+            break
     if len(near):
-        near = search.improved(near, np.concatenate([near, found, others]))[:count]
+        near = near[:count]
         others = others[search.durations(others) <= FAR * search.durations(near).min()]
     states = np.concatenate([near, search.nearest(others, count - len(near), APART, near)])
     states = states[[within(goal.errors(q), goal.bounds) for q in states]]
+    converged, blocked = search.converged, ""
     if search.colliding is None and not len(states):
         converged = 0
-    blocked = ""
     if search.colliding is not None and not len(states):
         blocked = str(next(iter(checker.contacts(search.colliding)), "in collision"))
-    return GoalSamples(states, attempts, converged, best, blocked)
+    return GoalSamples(states, search.attempts, converged, search.errors, blocked)
 
 
 def sample_on_constraints(
@@ -198,6 +190,10 @@ class _Search:
     """Search for states of a goal that are near the start in time.
 
     Attributes:
+        attempts: Number of descents from random states.
+        converged: Number of those that reached the goal.
+        errors: Error terms of the best of them.
+        least: Least duration of a direct motion to a state that reaches the goal, free or in collision [s].
         colliding: A state that reaches the goal in collision, or None.
     """
 
@@ -205,10 +201,48 @@ class _Search:
         self.goal, self.checker, self.rng = goal, checker, rng
         self.limits = goal.robot.limits
         self.start = goal.start.clip(self.limits.lower, self.limits.upper)
+        self.attempts, self.converged = 0, 0
+        self.errors: Mapping[str, float] = {}
+        self.least = math.inf
         self.colliding: Array | None = None
         self._reached = min(REACHED, *(bound / 2.0 for bound in goal.bounds.values() if bound))
         self._known: dict[bytes, bool] = {}  # whether a state is free
         self._blocked = np.empty((0, len(self.start)))
+        self._start_clearance = checker.kernel.clearance(self.start[None], 0.0)
+
+    def found(self, count: int, max_attempts: int) -> tuple[Array, Array]:
+        """Return free states of low cost, shape (N, dof), and all that descents reached, (M, dof), by a search anew.
+
+        Args:
+            count: Most states that are wanted.
+            max_attempts: Most descents of this search and those before.
+        """
+        near = known = reached = np.empty((0, len(self.start)))
+        first = self.attempts
+        while self.attempts < max_attempts and (not len(near) or self.attempts < first + FEW):
+            ends = self.descended(
+                self.first_states(min(BATCH, max_attempts - self.attempts), around_home=self.attempts > 0),
+                DESCENT_STEPS,
+            )
+            self.attempts += len(ends.states)
+            errors, bounds = self.goal.errors(ends.states[int(np.argmin(ends.errors))]), self.goal.bounds
+            if not self.errors or relative_error(errors, bounds) < relative_error(self.errors, bounds):
+                self.errors = errors
+            new = self.reached(ends)
+            self.converged += len(new)
+            reached = np.concatenate([reached, new])
+            if len(self.nearest(reached, 1, APART)):
+                new = np.concatenate([new, self.mixed(reached)])
+                known = np.concatenate([near, new, *self.approached(new)])
+            else:
+                known = reached = np.concatenate([reached, self.cleared(new)])
+            near = self.nearest(known, min(count, NEAREST), NEAR)
+        return (self.improved(near, np.concatenate([known, reached])) if len(near) else near), reached
+
+    def best_of(self, states: Array) -> Array:
+        """Return the free state of least cost and the nearest others, shape (N, dof)."""
+        best = states[self.free(states, self.costs(states, self.durations(states)), 1, 0.0)]
+        return np.concatenate([best, self.nearest(states, NEAREST - 1, NEAR, best)])
 
     def durations(self, states: Array) -> Array:
         """Return the least durations of direct motions to states, shape (N,) [s]."""
@@ -243,16 +277,42 @@ class _Search:
             exact = np.array([within(self.goal.errors(q), self.goal.bounds) for q in ends.states])
         return ends.states[exact]
 
+    def mixed(self, states: Array) -> Array:
+        """Return states of the goal with the joints of each of its parts from the states where these are nearest.
+
+        Parts of a goal depend on no joint in common, as the poses of two hands; with a single one there are none.
+
+        Args:
+            states: States that reach the goal, shape (N, dof).
+
+        Returns:
+            States that reach the goal, shape (M, dof).
+        """
+        parts = self._parts(states[0]) if len(states) else []
+        if len(parts) < 2:
+            return states[:0]
+        nearest = list[NDArray[np.intp]]()
+        for joints in parts:
+            alone = np.tile(self.start, (len(states), 1))
+            alone[:, joints] = states[:, joints]
+            nearest.append(np.argsort(self.durations(alone), kind="stable")[:MIXED])
+        rows = list(itertools.islice(itertools.product(*nearest), CHILDREN))
+        mixed = states[[row[0] for row in rows]]
+        for k, joints in enumerate(parts[1:], 1):
+            mixed[:, joints] = states[[row[k] for row in rows]][:, joints]
+        return mixed
+
     def approached(self, states: Array) -> list[Array]:
         """Return states moved within the goal towards the start, for each power, shape (N, dof) each."""
         found = list[Array]()
         for power, weight in zip(POWERS, WEIGHTS, strict=True):
+            if not len(states):
+                break
             durations = self.durations(states)
+            self.least = min(self.least, float(durations.min()))
             states = states[np.argsort(durations, kind="stable")[: max(int(KEPT * len(states)), 1)]]
             ends = self.goal.inverse.approach(states, self.start, self._reach(states), power, weight=weight)
             states = self.returned(ends.states)
-            if not len(states):
-                break
             found.append(states)
         return found
 
@@ -292,16 +352,18 @@ class _Search:
 
     def nearest(self, states: Array, count: int, apart: float, taken: Array | None = None) -> Array:
         """Return the free states that are nearest in time, see :meth:`free`."""
-        return states[self.free(states, self.durations(states) * self._closeness(states), count, apart, taken)]
+        closeness = _closeness(self.checker.kernel.clearance(states, KEPT_CLEAR))
+        return states[self.free(states, self.durations(states) * closeness, count, apart, taken)]
 
-    def costs(self, states: Array) -> Array:
+    def costs(self, states: Array, durations: Array) -> Array:
         """Return the durations to states, more by a share where the straight lines to them collide, shape (N,) [s]."""
-        ends = self.checker.kernel.clearance(np.concatenate([self.start[None], states]), 0.0)
+        clearances = self.checker.kernel.clearance(states, KEPT_CLEAR)
         lines = self.start + ALONG[:, None, None] * (states - self.start)
-        clearances = self.checker.kernel.clearance(lines.reshape(-1, states.shape[1]), 0.0)
-        least = np.minimum(ends[0], ends[1:])
-        depths = np.maximum(least - clearances.reshape(len(ALONG), len(states), 2), 0.0).sum(axis=2).mean(axis=0)
-        costs: Array = self.durations(states) * (1.0 + DETOUR * depths / (depths + DEPTH)) * self._closeness(states)
+        along = self.checker.kernel.clearance(lines.reshape(-1, states.shape[1]), 0.0)
+        least = np.minimum(self._start_clearance, clearances)
+        depths = np.maximum(least - along.reshape(len(ALONG), len(states), 2), 0.0).sum(axis=2).mean(axis=0)
+        blocked = 1.0 + DETOUR * depths / (depths + DEPTH)
+        costs: Array = durations * blocked * _closeness(clearances)
         return costs
 
     def improved(self, near: Array, known: Array) -> Array:
@@ -311,9 +373,10 @@ class _Search:
             near: The nearest free states, shape (N, dof).
             known: States that reach the goal, shape (M, dof).
         """
-        known = known[np.argsort(self.durations(known), kind="stable")[:CHILDREN]]
-        best = np.concatenate([near, known])
-        costs = self.costs(best)
+        durations = self.durations(known)
+        nearest = np.argsort(durations, kind="stable")[:CHILDREN]
+        best, durations = np.concatenate([near, known[nearest]]), np.append(self.durations(near), durations[nearest])
+        costs = self.costs(best, durations)
         rows = self.free(best, costs, NEAREST, NEAR)
         best, costs = best[rows], costs[rows]
         least, idle = np.inf, 0
@@ -323,13 +386,24 @@ class _Search:
             if idle >= PATIENCE:
                 break
             children = self._children(best, PULL)
-            children = children[self.durations(children) < costs.max()]
-            if len(children):
-                best, costs = np.concatenate([best, children]), np.append(costs, self.costs(children))
+            durations = self.durations(children)
+            sooner = durations < costs.max()
+            if sooner.any():
+                children, durations = children[sooner], durations[sooner]
+                best, costs = np.concatenate([best, children]), np.append(costs, self.costs(children, durations))
                 rows = self.free(best, costs, NEAREST, 0.0)
                 best, costs = best[rows], costs[rows]
         best = best[:1]
         return np.concatenate([best, self.nearest(np.concatenate([near, best]), NEAREST - 1, NEAR, best)])
+
+    def _parts(self, q: Array) -> list[NDArray[np.int64]]:
+        """Return the joints of each part of the goal, by the Jacobian at a state, shape (dof,)."""
+        free = self.goal.inverse.free
+        depends = self.goal.inverse.residual(q)[1][:, free] != 0.0
+        part = np.arange(len(free))
+        for row in depends[depends.any(axis=1)]:
+            part[np.isin(part, part[row])] = part[row].min()
+        return [free[part == k] for k in np.unique(part[depends.any(axis=0)])]
 
     def _reach(self, states: Array) -> Array:
         """Return how far the joints move in the least duration to one of states, shape (dof,)."""
@@ -344,12 +418,6 @@ class _Search:
         change += pull * rng.random((CHILDREN, 1)) * (self.start - children)
         children[:, free] += change[:, free]
         return self.returned(children)
-
-    def _closeness(self, states: Array) -> Array:
-        """Return factors on durations for states that are near something, shape (N,)."""
-        near = KEPT_CLEAR - self.checker.kernel.clearance(states, KEPT_CLEAR)
-        factors: Array = 1.0 + CLOSE * np.minimum(near.max(axis=1, initial=0.0) / KEPT_CLEAR, 1.0)
-        return factors
 
     def _clearances(self, states: Array) -> Array:
         """Return the sum of the least clearances to obstacles and of the robot to itself, shape (N,) [m]."""
@@ -367,6 +435,13 @@ class _Search:
                 self.colliding = q
                 self._blocked = np.concatenate([self._blocked, q[None]])
         return self._known[key]
+
+
+def _closeness(clearances: Array) -> Array:
+    """Return factors on durations for states that are near something, shape (N,), for clearances, shape (N, 2) [m]."""
+    near = (KEPT_CLEAR - clearances).max(axis=1, initial=0.0)
+    factors: Array = 1.0 + CLOSE * np.minimum(near / KEPT_CLEAR, 1.0)
+    return factors
 
 
 def unit_of(name: str) -> str:

@@ -89,6 +89,32 @@ def test_states_reach_poses_by_pinocchio_and_leave_the_other_arm_alone(
         assert np.array_equal(state[right], robot.home[right])
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_poses_of_two_hands_are_as_near_as_the_farther_of_them_alone(robot: Robot, seed: int) -> None:
+    rng = np.random.default_rng([seed, 3])
+    q = (robot.home + rng.normal(0.0, 0.4, robot.dof)).clip(robot.limits.lower, robot.limits.upper)
+    targets = [pose_target(robot, q, hand) for hand in ("left_hand", "right_hand")]
+    checker, nearest = CollisionChecker(robot), list[float]()
+    for some in ([targets[0]], [targets[1]], targets):
+        found = sample(PoseGoal(robot, some, (), robot.home), checker, np.random.default_rng(seed))
+        nearest.append(float(direct_durations(robot.home, found.states, robot.limits).min()))
+    assert nearest[2] <= 1.03 * max(nearest[:2])
+
+
+def test_descents_of_which_the_last_arrive_nowhere(robot: Robot) -> None:
+    """The 33rd descends from the start alone, and ends elsewhere."""
+    rng, tried = np.random.default_rng(4), 0
+    for _ in range(40):
+        q = robot.random_state(rng)
+        goal = PoseGoal(robot, [pose_target(robot, q, "left_hand")], (), robot.home)
+        if goal.inverse.descend(robot.home, tolerance=1e-6, max_steps=40).errors[0] < 1e-2:
+            continue
+        found = sample(goal, CollisionChecker(robot), np.random.default_rng(0), max_attempts=33)
+        assert found.attempts == 33
+        tried += len(found.states) > 0
+    assert tried > 2
+
+
 def test_a_start_that_reaches_the_goal_is_returned_first(robot: Robot) -> None:
     goal = PoseGoal(robot, [pose_target(robot, robot.home, "right_hand")], (), robot.home)
     found = sample(goal, CollisionChecker(robot), np.random.default_rng(0))

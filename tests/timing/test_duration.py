@@ -10,15 +10,17 @@ from scipy.optimize import linprog
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.duration import DurationSettings, TimeGrid, lower_duration
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.robot import Robot
 from apex_ompl.robot.rest_to_rest import direct_durations
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import duration as duration_module
 from apex_ompl.timing import time_path
 from apex_ompl.timing.duration import LEVELS, DurationOptimizer
 from apex_ompl.timing.spline_method import least_knot_spacing
-from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline
+from apex_ompl.timing.timed_spline import PINNED, Start, TimedSpline, basis
 from apex_ompl.types import Array
 
 
@@ -118,6 +120,29 @@ def test_motions_among_obstacles_are_faster_than_along_the_path_and_free(name: s
     assert motion.duration < 0.97 * along.duration
     assert full_check(setup.checker, motion, setup.start, setup.goals)
     assert max(motion.use(limits).values()) <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize(("turn", "middle"), [(0.2, -0.001), (0.5, -0.00325), (1.4, -0.004)])
+def test_the_margin_of_a_near_end_grows_back_away_from_it(robot: Robot, turn: float, middle: float) -> None:
+    """A turn 1 mm below a ceiling: least clearance over a margin of 5 mm, which is 0.5 mm at the ends."""
+    start, goal = robot.home.copy(), robot.home.copy()
+    start[0], goal[0] = -0.5 * turn, 0.5 * turn
+    height = 0.8
+    for _ in range(2):
+        ceiling = Obstacle(name="ceiling", box=(4.0, 4.0, 0.1), position=(0.0, 0.0, height + 0.05))
+        kernel = CollisionChecker(robot, [ceiling]).kernel
+        height -= float(kernel.clearance(start)[0, 0]) - 0.001
+    control = np.repeat(np.stack([start, goal]), PINNED, axis=0)
+    control = np.concatenate([control[:PINNED], np.linspace(start, goal, 30)[1:-1], control[PINNED:]])
+    limits = np.stack([robot.limits.velocity, robot.limits.acceleration, robot.limits.jerk])
+    settings = DurationSettings(0.005, 0.02, 1e-3, 1e-5, 0.3, 0.25, 1e-3, 1.0, 0.0, 1)
+    grid = TimeGrid.of(len(control), 4, basis((np.arange(4) + 0.5) / 4))
+    states = np.array([w @ control[k : k + 4] for w, k in zip(grid.weights, grid.first, strict=True)])
+    np.testing.assert_allclose(kernel.clearance(states)[:, 0], 0.001, atol=1e-6)
+    spacing = 1.05 * least_knot_spacing(control, robot.limits)
+    report = lower_duration(kernel, grid, limits, PINNED, control, spacing, settings)
+    assert report.steps == 1
+    assert report.clearance == pytest.approx(middle, abs=1e-4)
 
 
 def test_joints_that_stay_do_so_bit_for_bit(robot: Robot) -> None:

@@ -18,7 +18,8 @@ Slacks and multipliers take the largest steps that keep them positive (a primal-
 and Wright 2006, chapter 19). mu is a share of the mean of s z, which vanishes at an optimum. M is the mass matrix of
 the samples.
 
-The margin of a pair that is nearer at the start or the goal is lower, so that motions may start and end there.
+The margin of a pair that is nearer at the start or the goal is lower around there, so that motions may start and end
+there; it grows back linearly in the distance from that end.
 """
 
 from __future__ import annotations
@@ -48,6 +49,7 @@ UNIT = 0.01  # of clearances [m]
 LEAST_SLACK = 0.02  # of a clearance that is new and too low [UNIT]
 LEAST_BOUND_SLACK = 1e-6  # of a position limit [rad]
 END_ROOM = 5e-4  # by which a motion may come nearer than its ends are [m]
+END_REACH = 0.3  # distance from an end, of the joint that moves most, within which its margins are lower [rad]
 LEAST_MEAN = 1e-8  # of slacks times multipliers
 TO_BOUNDARY = 0.995  # share of the way to the boundary that a step takes at most
 ROWS_PER_SAMPLE = 40  # clearances of a motion, on average at most
@@ -326,14 +328,47 @@ def _add_sample(p: Problem, k: int, free: int, dof: int, b: Buffers) -> None:
                     target[shift + e] += g * source[e]
 
 
+class Ends(NamedTuple):
+    """Clearances at start and goal that are below the margin, of which those at the start come first.
+
+    Attributes:
+        starts: Number of those at the start.
+        total: Number of all.
+    """
+
+    starts: int
+    total: int
+
+
 @reassociating_inlined
-def _set_rows(p: Problem, margin: float, mu: float, now: int, k: int, ends: int, b: Buffers) -> float:
+def _nearness(q: Floats, end: Floats) -> float:
+    """Return 1 at an end of the motion, less in a state ``q`` farther from it, and 0 from ``END_REACH`` on."""
+    distance = 0.0
+    for d in range(len(q)):
+        distance = max(distance, abs(q[d] - end[d]))
+    return max(0.0, 1.0 - distance / END_REACH)
+
+
+@reassociating_inlined
+def _margin_of(key: int, margin: float, near_start: float, near_goal: float, ends: Ends, b: Buffers) -> float:
+    """Return the margin of a clearance in a state near the ends as told [m]."""
+    own, at = margin, _place_of(key, b.end_key, 0, ends.starts)
+    if at >= 0:
+        own = min(own, margin - near_start * (margin + END_ROOM - b.end_clearance[at]))
+    at = _place_of(key, b.end_key, ends.starts, ends.total)
+    if at >= 0:
+        own = min(own, margin - near_goal * (margin + END_ROOM - b.end_clearance[at]))
+    return own
+
+
+@reassociating_inlined
+def _set_rows(
+    p: Problem, margin: float, mu: float, now: int, k: int, near_start: float, near_goal: float, ends: Ends, b: Buffers
+) -> float:
     """Set the clearances of sample ``k`` over their margins, their slacks and multipliers; return the least [UNIT]."""
     before, worst = 1 - now, math.inf
     for r in range(b.begin[now, k], b.begin[now, k + 1]):
-        own, at = margin, _place_of(b.key[now, r], b.end_key, 0, ends)
-        if at >= 0:
-            own = min(own, b.end_clearance[at] - END_ROOM)
+        own = _margin_of(b.key[now, r], margin, near_start, near_goal, ends, b)
         c = (b.clearance[r] - own) / UNIT
         worst = min(worst, c)
         slack = max(c, LEAST_SLACK)
@@ -389,7 +424,7 @@ def _no_penalty(penalty: NoPenalty, t: RobotArrays, w: Workspace, q: Floats, b: 
 @reassociating_inlined
 def _add_clearances(
     t: RobotArrays, s: SceneArrays, w: Workspace, p: Problem, control: Floats, settings: DurationSettings, mu: float,
-    now: int, ends: int, b: Buffers, penalize: Penalize, penalty: Penalty,
+    now: int, ends: Ends, b: Buffers, penalize: Penalize, penalty: Penalty,
 ) -> float:  # fmt: skip
     """Add the clearances at all samples; return the least of them over its margin [m], minus infinity at a fault."""
     points, dof = control.shape
@@ -404,7 +439,8 @@ def _add_clearances(
         b.begin[now, k + 1] = count
         if count == first and not penalty.always:
             continue
-        worst = min(worst, _set_rows(p, settings.margin, mu, now, k, ends, b))
+        near_start, near_goal = _nearness(q, control[0]), _nearness(q, control[points - 1])
+        worst = min(worst, _set_rows(p, settings.margin, mu, now, k, near_start, near_goal, ends, b))
         _sum_rows(mu, now, k, b)
         penalize(penalty, t, w, q, b)
         _add_sample(p, k, free, dof, b)
@@ -643,8 +679,9 @@ def descend(
     """
     points, dof = control.shape
     unknowns = len(b.gradient)
-    ends = _clearances(t, s, w, control[0], settings.margin, 0, b.end_clearance, b.row[:0], b.end_key)
-    ends = _clearances(t, s, w, control[points - 1], settings.margin, ends, b.end_clearance, b.row[:0], b.end_key)
+    starts = _clearances(t, s, w, control[0], settings.margin, 0, b.end_clearance, b.row[:0], b.end_key)
+    count = _clearances(t, s, w, control[points - 1], settings.margin, starts, b.end_clearance, b.row[:0], b.end_key)
+    ends = Ends(starts, count)
     u, mu, total, worst, now, taken = math.log(spacing), settings.mean, math.inf, -math.inf, 0, 0
     _start_duals(t, p, control, u, mu, b)
     mu *= settings.decrease
