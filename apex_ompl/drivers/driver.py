@@ -41,7 +41,7 @@ class Driver(Protocol):
         ...
 
     def send(self, motion: Trajectory, at: float) -> None:
-        """Follow a motion from a time on; it replaces what was commanded from then on.
+        """Follow a motion from a time on; it replaces what was commanded afterwards.
 
         Args:
             motion: The motion, which ends at rest.

@@ -235,13 +235,12 @@ class MujocoDriver:
     def _advance(self, count: int) -> None:
         """Simulate some steps."""
         twin, data = self.twin, self.data
-        times: Array = (self._steps + np.arange(count)) * twin.settings.step
+        times = np.asarray((self._steps + np.arange(count)) * twin.settings.step, np.float64)
         self._commands.forget(float(times[0]) - twin.settings.step)
         q, v, a = self._commands.states(times)
         own = self._rotors * a + self._friction * v
         torques = self._loaded.torques(q, v, a) - self._bare.torques(q) + own
-        earlier: Array = times - twin.settings.step / 2.0
-        before = self._commands.states(earlier)[1]
+        before = self._commands.states(times - twin.settings.step / 2.0)[1]
         feedforward = torques + twin.kp * q + twin.kd * before
         rows = np.stack([q, np.empty_like(q), own, np.empty_like(q)], axis=2)
         for k, row in enumerate(rows):

@@ -108,10 +108,12 @@ def mimic_joints(urdf: str) -> tuple[Mimic, ...]:
         if mimic is not None and joint.get("type") != "fixed":
             name, leader = str(joint.get("name")), str(mimic.get("joint"))
             found[name] = Mimic(name, leader, float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0)))
-    for name in found:
-        while (over := found.get(found[name].leader)) is not None:
-            m, b = found[name].multiplier, found[name].offset
-            found[name] = Mimic(name, over.leader, m * over.multiplier, m * over.offset + b)
+    for name, own in list(found.items()):
+        chain = own
+        while (over := found.get(chain.leader)) is not None:
+            m, b = chain.multiplier, chain.offset
+            chain = Mimic(name, over.leader, m * over.multiplier, m * over.offset + b)
+        found[name] = chain
     return tuple(found.values())
 
 
@@ -141,7 +143,7 @@ class Twin:
 
         Raises:
             MissingFileError: The extra ``twin`` is not installed, or the file of a shape cannot be read.
-            ParameterError: There are gains of an unknown joint.
+            UnknownNameError: There are gains of an unknown joint.
             SceneError: A shape has no counterpart in MuJoCo.
             RobotError: MuJoCo cannot make a model of the robot, or one without all mimic joints.
         """
@@ -312,13 +314,13 @@ class Twin:
             body.gravcomp = 1.0
             if list(body.joints) and not body.mass > 0.0:
                 body.mass, body.inertia, body.explicitinertial = LEAST_MASS, [LEAST_INERTIA] * 3, True
+                body.ipos = np.zeros(3)
 
     def _add_joints(self, spec: Any) -> None:
         """Set up joints, motors and the equalities of mimic joints."""
         mj, settings, robot = self._mj, self.settings, self.robot
         for name in settings.gains:
-            if name not in robot.joint_names:
-                raise ParameterError(f"gains.{name}", name, f"one of the joints {', '.join(robot.joint_names)}")
+            check_name(name, "joint", robot.joint_names)
         for equality in list(spec.equalities):  # some versions make them of a URDF, some do not
             spec.delete(equality)
         leaders, followers = {one.leader for one in self.mimics}, {one.joint for one in self.mimics}
@@ -372,6 +374,7 @@ class Twin:
         """Add the mass of a payload, which has no shape."""
         added = spec.body(load.link).add_body(name=f"payload {next(self._numbers)}", pos=load.center)
         added.mass, added.inertia, added.explicitinertial = load.mass, np.diag(load.inertia), True
+        added.ipos = np.zeros(3)  # else it counts twice
 
     def _add_geoms(
         self, spec: Any, body: Any, geometry: coal.CollisionGeometry, pose: Array, role: str
