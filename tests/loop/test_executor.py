@@ -17,7 +17,7 @@ from loops import BLOCKED, PROBLEM, ByHand, Find, boxes, context_of, crossing, g
 from apex_ompl import run
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
-from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.executor import Executor
 from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.replan.evasion import endangered, step_aside
