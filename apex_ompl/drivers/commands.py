@@ -58,7 +58,7 @@ class Commands:
         begin = 0
         for start, motion, end in zip(self._starts, self._motions, first, strict=True):
             if end > begin:
-                found[:, begin:end] = motion.states(times[begin:end] - start)
+                found[:, begin:end] = motion.states(np.maximum(times[begin:end] - start, 0.0))
             begin = max(begin, end)
         return found
 
