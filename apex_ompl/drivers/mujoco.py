@@ -225,7 +225,7 @@ class MujocoDriver:
         try:
             return self.twin.renderer(width, height)
         except Exception as error:  # of several kinds, by what is missing
-            why = f"{' '.join(str(error).split())}; install EGL (libegl1) or OSMesa (libosmesa6), see MUJOCO_GL"
+            why = f"{' '.join(str(error).split())}; install libegl1 or libosmesa6, and set MUJOCO_GL to egl or osmesa"
             raise MissingFileError("OpenGL", "library for pictures", why) from error
 
     def _check_open(self) -> None:

@@ -411,12 +411,17 @@ class Twin:
             spec.add_exclude(bodyname1=first, bodyname2=second)
 
     def _add_surroundings(self, spec: Any) -> None:
-        """Add the floor and lights."""
+        """Add the floor, light and background."""
         floor = spec.worldbody.add_geom(name="floor", type=self._mj.mjtGeom.mjGEOM_PLANE)
         floor.size, floor.pos, floor.rgba = [3.0, 3.0, 0.1], [0.0, 0.0, self.settings.floor], COLORS["floor"]
         floor.contype, floor.conaffinity, floor.condim = FALLING, 0, 4
-        spec.worldbody.add_light(pos=[1.0, -1.0, 3.0], dir=[-0.3, 0.3, -1.0])
-        spec.worldbody.add_light(pos=[1.0, 1.5, 2.5], dir=[-0.3, -0.5, -1.0])
+        mj = self._mj
+        light = spec.worldbody.add_light(pos=[1.0, -1.0, 3.0], dir=[-0.3, 0.3, -1.0])
+        light.type, light.diffuse = mj.mjtLightType.mjLIGHT_DIRECTIONAL, [0.5, 0.5, 0.5]
+        spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4, 0.4, 0.4], [0.35, 0.35, 0.35]
+        spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+        sky = spec.add_texture(name="sky", type=mj.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=64)
+        sky.builtin, sky.rgb1, sky.rgb2 = mj.mjtBuiltin.mjBUILTIN_GRADIENT, COLORS["floor"][:3], COLORS["floor"][:3]
         spec.visual.quality.numslices, spec.visual.quality.numstacks = 64, 32
 
 
