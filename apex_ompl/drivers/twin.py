@@ -296,6 +296,7 @@ class Twin:
         except ValueError as error:
             raise RobotError(f"MuJoCo cannot read the URDF of {self.robot.name} ({error})") from error
         spec.compiler.fusestatic = False  # else links on fixed joints vanish
+        spec.compiler.discardvisual = False  # else the background does
         spec.compiler.inertiafromgeom = mj.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         option = spec.option
         option.timestep, option.integrator = self.settings.step, mj.mjtIntegrator.mjINT_IMPLICITFAST
