@@ -3,7 +3,7 @@
 The motions are those that apex plans for the ready-made problems, and for a validation problem of some levels. Each is
 planned with and without limits of torque in its timing, with nothing or 2 kg in each hand beside the held objects, and
 followed by MuJoCo (``apex_ompl.drivers``). Held objects without a mass have 300 kg/m^3. The limits are 87 and 12 Nm at
-the links. A motion is clipped where a motor reaches its limit. In the last row the controller does not know of the 2 kg.
+the links. A motion is clipped where a motor reaches its limit. In the last row the controller does not know the 2 kg.
 
 Usage: python -m benchmarks.physics.tracking [PROBLEM ...] [--payload 2]
 """
