@@ -15,7 +15,7 @@ from apex_ompl.drivers import Driver, MujocoDriver, TwinSettings
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.dynamics import Dynamics
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
 
@@ -214,8 +214,15 @@ def test_bad_input_is_named(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> No
         driver.advance(float("nan"))
     with pytest.raises(ParameterError, match="size"):
         driver.picture((0, 10))
+    with pytest.raises(ParameterError, match="size"):
+        driver.picture((10,))
     with pytest.raises(UnknownNameError, match="no_such"):
         driver.pose("no_such")
+    with pytest.raises(UnknownNameError, match="no_such"):
+        MujocoDriver(robot, at_home(robot, payload={"no_such": 1.0}))
+    ball = AttachedObject(name="ball", link="no_such", sphere={"radius": 0.03}, touch_links=())
+    with pytest.raises(UnknownNameError, match="no_such"):
+        MujocoDriver(robot, at_home(robot, attached=(ball,)))
     with pytest.raises(ApexError, match="position"):
         MujocoDriver(robot, state=np.zeros(3))
 
