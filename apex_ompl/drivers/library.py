@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from ctypes.util import find_library
 from importlib import import_module
 from typing import Any
 
@@ -11,13 +12,13 @@ from apex_ompl.util.forking import unforked
 
 
 def mujoco() -> Any:
-    """Return the module ``mujoco``, set up to draw by EGL on a machine without a display.
+    """Return the module ``mujoco``, set up to draw by EGL or OSMesa on a machine without a display.
 
     Raises:
         MissingFileError: The extra ``twin`` is not installed.
     """
     if not os.environ.get("DISPLAY"):
-        os.environ.setdefault("MUJOCO_GL", "egl")  # which is read at the import
+        os.environ.setdefault("MUJOCO_GL", "egl" if find_library("EGL") else "osmesa")  # which is read at the import
     try:
         with unforked():
             return import_module("mujoco")

@@ -15,16 +15,15 @@ import numpy as np
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
-from apex_ompl.drivers.twin import AWAY, Twin, TwinSettings, held_loads
+from apex_ompl.drivers.twin import Twin, TwinSettings, held_loads
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.robot.dynamics import Dynamics
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.scripts import is_there, place_at
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import fields_line
-from apex_ompl.util.validation import check_integer, finite_array
+from apex_ompl.util.validation import check_array, check_integer, finite_array
 
 BLOCK = 500  # steps whose commands are computed at once
 MOST_STEPS = 10**7  # of one advance
@@ -103,8 +102,6 @@ class MujocoDriver:
         self._commands = Commands(self.names, self.limits, state, tolerance)
         self.twin = twin = Twin(robot, problem, settings)
         self.data = twin.data(finite_array(state, "state"))
-        self._place_obstacles(0.0)
-        twin.forward(self.data)
         loads = twin.loads if assumed is None else held_loads(robot, assumed, twin.settings)
         self._loaded, self._bare = Dynamics(robot, loads), Dynamics(robot)
         self._rotors, self._friction = twin.rotor_inertia, twin.friction
@@ -171,7 +168,7 @@ class MujocoDriver:
         """Pairs of bodies that touched since the start, by name, and how deep at most [m].
 
         Pairs that may touch are left out: those that the robot's checker does not check, held objects and the links
-        that may touch them, and those that the problem allows.
+        that may touch them, and those that the problem allows. The floor is ``world``.
         """
         return dict(self._contacts)
 
@@ -212,6 +209,7 @@ class MujocoDriver:
             MissingFileError: There is no OpenGL.
         """
         self._check_open()
+        check_array(finite_array(size, "size"), (2,), "size")
         width, height = (check_integer(side, "size", 1, LARGEST_PICTURE) for side in size)
         camera = self.twin.camera(float(finite_array(azimuth, "azimuth")), ELEVATION, DISTANCE, CENTER)
         if self._renderer is None or (self._renderer.width, self._renderer.height) != (width, height):
@@ -225,7 +223,7 @@ class MujocoDriver:
         try:
             return self.twin.renderer(width, height)
         except Exception as error:  # of several kinds, by what is missing
-            why = f"{' '.join(str(error).split())}; install EGL (libegl1) or OSMesa (libosmesa6), see MUJOCO_GL"
+            why = f"{' '.join(str(error).split())}; install libegl1 or libosmesa6, and set MUJOCO_GL to egl or osmesa"
             raise MissingFileError("OpenGL", "library for pictures", why) from error
 
     def _check_open(self) -> None:
@@ -246,8 +244,7 @@ class MujocoDriver:
         for k, row in enumerate(rows):
             row[:, 1] = data.qpos[twin.q]
             data.ctrl[twin.u] = feedforward[k] - twin.kp * row[:, 1] - twin.kd * data.qvel[twin.v]
-            if twin.moving:
-                self._place_obstacles(float(times[k]))
+            twin.move_obstacles(data, float(times[k]))
             twin.step(data)
             row[:, 3] = twin.asked_torques(data)
             for pair, depth in twin.contacts(data).items():
@@ -255,7 +252,3 @@ class MujocoDriver:
         self._times.append(times)
         self._parts.append(rows)
         self._steps += count
-
-    def _place_obstacles(self, time: float) -> None:
-        for one in self.twin.moving:
-            self.twin.move(self.data, one.name, place_at(one, time) if is_there(one, time) else AWAY)

@@ -30,6 +30,7 @@ from apex_ompl.robot.dynamics import Load
 from apex_ompl.robot.model import Robot, link_of
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, place_at
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_name, check_number, check_positive, finite_numbers
 
@@ -143,7 +144,7 @@ class Twin:
 
         Raises:
             MissingFileError: The extra ``twin`` is not installed, or the file of a shape cannot be read.
-            UnknownNameError: There are gains of an unknown joint.
+            UnknownNameError: There is no joint of the gains, or no link that holds an object or a payload.
             SceneError: A shape has no counterpart in MuJoCo.
             RobotError: MuJoCo cannot make a model of the robot, or one without all mimic joints.
         """
@@ -202,19 +203,17 @@ class Twin:
         data.qpos[self._followers] = self._line[:, 0] * data.qpos[self._leaders] + self._line[:, 1]
         for one in self.held:
             self._set_free(data, one.name, self.robot.link_pose(state, one.link) @ one.pose)
+        self.move_obstacles(data, time)
         self._mj.mj_forward(self.model, data)
 
-    def forward(self, data: Any) -> None:
-        """Compute what depends on the state."""
-        self._mj.mj_forward(self.model, data)
+    def move_obstacles(self, data: Any, time: float) -> None:
+        """Put the obstacles that move to where they are at a time [s]; those that have not appeared are far below."""
+        for one in self.moving:
+            data.mocap_pos[self._mocap[one.name]] = place_at(one, time) if is_there(one, time) else AWAY
 
     def step(self, data: Any) -> None:
         """Simulate one step."""
         self._mj.mj_step(self.model, data)
-
-    def move(self, data: Any, name: str, place: Array) -> None:
-        """Put an obstacle that moves to a place, shape (3,) [m]."""
-        data.mocap_pos[self._mocap[name]] = place
 
     def asked_torques(self, data: Any) -> Array:
         """Return the torques that the motors and the compensation of gravity ask for, shape (dof,) [Nm]."""
@@ -245,7 +244,10 @@ class Twin:
         return found
 
     def contacts(self, data: Any) -> dict[tuple[str, str], float]:
-        """Return the pairs of bodies that touch by their names, and how deep [m]; pairs that may touch are left out."""
+        """Return the pairs of bodies that touch by their names, and how deep [m]; the floor is ``world``.
+
+        Pairs that may touch are left out.
+        """
         if not data.ncon:
             return {}
         found: dict[tuple[str, str], float] = {}
@@ -296,6 +298,7 @@ class Twin:
         except ValueError as error:
             raise RobotError(f"MuJoCo cannot read the URDF of {self.robot.name} ({error})") from error
         spec.compiler.fusestatic = False  # else links on fixed joints vanish
+        spec.compiler.discardvisual = False  # else the background does
         spec.compiler.inertiafromgeom = mj.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
         option = spec.option
         option.timestep, option.integrator = self.settings.step, mj.mjtIntegrator.mjINT_IMPLICITFAST
@@ -358,6 +361,7 @@ class Twin:
     def _add_held(self, spec: Any, held: AttachedObject) -> None:
         """Add a held object: a free body, welded to the link that holds it."""
         mj = self._mj
+        self.robot.link_frame(held.link)
         added = spec.worldbody.add_body(name=held.name)
         added.add_freejoint(name=held.name)
         load = held_load(held.model_copy(update={"position": (0.0, 0.0, 0.0), "orientation": (0.0, 0.0, 0.0, 1.0)}))
@@ -411,12 +415,17 @@ class Twin:
             spec.add_exclude(bodyname1=first, bodyname2=second)
 
     def _add_surroundings(self, spec: Any) -> None:
-        """Add the floor and lights."""
+        """Add the floor, light and background."""
         floor = spec.worldbody.add_geom(name="floor", type=self._mj.mjtGeom.mjGEOM_PLANE)
         floor.size, floor.pos, floor.rgba = [3.0, 3.0, 0.1], [0.0, 0.0, self.settings.floor], COLORS["floor"]
         floor.contype, floor.conaffinity, floor.condim = FALLING, 0, 4
-        spec.worldbody.add_light(pos=[1.0, -1.0, 3.0], dir=[-0.3, 0.3, -1.0])
-        spec.worldbody.add_light(pos=[1.0, 1.5, 2.5], dir=[-0.3, -0.5, -1.0])
+        mj = self._mj
+        light = spec.worldbody.add_light(pos=[1.0, -1.0, 3.0], dir=[-0.3, 0.3, -1.0])
+        light.type, light.diffuse = mj.mjtLightType.mjLIGHT_DIRECTIONAL, [0.5, 0.5, 0.5]
+        spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4, 0.4, 0.4], [0.35, 0.35, 0.35]
+        spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+        sky = spec.add_texture(name="sky", type=mj.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=64)
+        sky.builtin, sky.rgb1, sky.rgb2 = mj.mjtBuiltin.mjBUILTIN_GRADIENT, COLORS["floor"][:3], COLORS["floor"][:3]
         spec.visual.quality.numslices, spec.visual.quality.numstacks = 64, 32
 
 
@@ -429,8 +438,14 @@ def with_mass(held: AttachedObject, density: float) -> AttachedObject:
 
 
 def payloads(robot: Robot, problem: Problem) -> tuple[Load, ...]:
-    """Return the payload of a problem: balls at the grasp points of hands, or at the origins of links."""
+    """Return the payload of a problem: balls at the grasp points of hands, or at the origins of links.
+
+    Raises:
+        UnknownNameError: There is no such hand or link.
+    """
     points = {name: (hand.palm, np.asarray(hand.point)) for name, hand in robot.hands.items()}
+    for name in problem.payload:
+        robot.link_frame(points.get(name, (name,))[0])
     found = ((*points.get(name, (name, np.zeros(3))), mass) for name, mass in problem.payload.items())
     inertia = 0.4 * PAYLOAD_RADIUS**2 * np.eye(3)
     return tuple(Load(link, mass, point, mass * inertia) for link, point, mass in found)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from physics import library
 from planning import cached_problem
 from small_arm import write_arm
 from support import STEP, states_around_home
@@ -24,10 +25,9 @@ from apex_ompl.robot.dynamics import Dynamics
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 
-mujoco = pytest.importorskip("mujoco")
+mujoco = library()
 
 ROBOTS = ("dual_panda_softhand", "panda", "baxter")
-TURNED = (0.0, 0.6, 0.0, 0.8)
 
 
 def problem_of(robot: Robot, scene: tuple[Obstacle, ...] = (), **more: Any) -> Problem:
@@ -56,7 +56,11 @@ SHAPES: dict[str, Callable[[Path], dict[str, Any]]] = {
     "sphere": lambda _: {"sphere": {"radius": 0.12}},
     "cylinder": lambda _: {"cylinder": {"radius": 0.08, "length": 0.4}},
     "capsule": lambda _: {"capsule": {"radius": 0.07, "length": 0.3}},
-    "half_space": lambda _: {"half_space": {"normal": (1.0, 0.3, -0.5), "offset": -0.45}},
+    "half_space": lambda _: {
+        "half_space": {"normal": (0.0, 1.0, 0.5), "offset": -0.35},
+        "position": (0.0, 0.0, 0.0),
+        "orientation": (0.0, 0.0, 0.6, 0.8),
+    },
     "mesh": lambda folder: {"mesh": {"file": step(folder)}},
     "points": lambda folder: {"points": {"file": cloud(folder), "radius": 0.02}},
     "voxels": lambda folder: {"voxels": {"file": voxels(folder)}},
@@ -174,9 +178,8 @@ def disagreements(robot: Robot, problem: Problem, states: np.ndarray) -> tuple[i
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_contacts_are_the_verdicts_of_the_checker(robot: Robot, tmp_path: Path, shape: str) -> None:
-    obstacle = Obstacle(
-        name="it", position=(0.3, 0.5, 0.5), orientation=TURNED, **SHAPES[shape](tmp_path)
-    )  # fmt: skip
+    pose = {"position": (0.3, 0.5, 0.5), "orientation": (0.0, 0.6, 0.0, 0.8)}
+    obstacle = Obstacle(name="it", **(pose | SHAPES[shape](tmp_path)))
     states = states_around_home(robot, np.random.default_rng(5), 50, 0.3)
     wrong, colliding = disagreements(robot, problem_of(robot, (obstacle,)), states)
     assert wrong == 0 and 5 < colliding < 45
