@@ -74,7 +74,7 @@ class Commands:
 
     def stop(self, now: float) -> None:
         """Come to rest along the motion that is under way, and drop those that wait; the time is ``now`` [s]."""
-        k = bisect_right(self._starts, now) - 1
+        k = max(bisect_right(self._starts, now) - 1, 0)
         motion = self._motions[k]
         if 0.0 < now - self._starts[k] < motion.duration:
             motion = motion.stop_at(now - self._starts[k], self.limits)
@@ -82,7 +82,7 @@ class Commands:
 
     def forget(self, now: float) -> None:
         """Drop motions that were replaced before a time [s], which ``states`` is not asked for again."""
-        k = bisect_right(self._starts, now) - 1
+        k = max(bisect_right(self._starts, now) - 1, 0)
         del self._starts[:k], self._motions[:k]
 
     def _check(self, motion: Trajectory) -> None:

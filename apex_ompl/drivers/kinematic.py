@@ -15,7 +15,7 @@ from apex_ompl.robot.model import Robot
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
-from apex_ompl.util.validation import check_number, finite_array
+from apex_ompl.util.validation import check_array, check_number, finite_array
 
 
 class KinematicDriver:
@@ -45,6 +45,7 @@ class KinematicDriver:
             ParameterError: The state has another shape or a number that is not finite, or is outside the limits.
         """
         at = finite_array(robot.home if state is None else state, "state")
+        check_array(at, (robot.dof,), "state")
         self.names, self.limits = robot.joint_names, robot.limits
         self._commands = Commands(self.names, self.limits, at, tolerance)
         fault = robot.limit_fault(at)
