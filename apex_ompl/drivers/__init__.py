@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from apex_ompl.drivers.driver import DriverState as DriverState
     from apex_ompl.drivers.kinematic import KinematicDriver as KinematicDriver
     from apex_ompl.drivers.mujoco import MujocoDriver as MujocoDriver
+    from apex_ompl.drivers.ros2 import Ros2Driver as Ros2Driver
     from apex_ompl.drivers.twin import Twin as Twin
     from apex_ompl.drivers.twin import TwinSettings as TwinSettings
 
@@ -20,6 +21,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "driver": "Driver DriverState",
         "kinematic": "KinematicDriver",
         "mujoco": "MujocoDriver",
+        "ros2": "Ros2Driver",
         "twin": "Twin TwinSettings",
     },  # fmt: skip
 )

@@ -80,6 +80,12 @@ class Commands:
             motion = motion.stop_at(now - self._starts[k], self.limits)
         self._starts[k:], self._motions[k:] = [self._starts[k]], [motion]
 
+    def stopping(self, at: float) -> Trajectory:
+        """Return the stop along the motion that is under way at a time, from that time on [s]."""
+        k = max(bisect_right(self._starts, at) - 1, 0)
+        motion, since = self._motions[k], max(at - self._starts[k], 0.0)
+        return motion.stop_at(since, self.limits).after(since) if since < motion.duration else motion.after(since)
+
     def forget(self, now: float) -> None:
         """Drop motions that were replaced before a time [s], which ``states`` is not asked for again."""
         k = max(bisect_right(self._starts, now) - 1, 0)
