@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from apex_ompl.api import setup as setup
     from apex_ompl.collision.cloud_contact import filter_points as filter_points
     from apex_ompl.errors import ApexError as ApexError
+    from apex_ompl.loop.loop import Loop as Loop
     from apex_ompl.loop.result import RunResult as RunResult
     from apex_ompl.loop.sensor import Sensor as Sensor
     from apex_ompl.model.checkpoint import load_model as load_model
@@ -51,6 +52,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "api": "load_problem plan run setup",
         "collision.cloud_contact": "filter_points",
         "errors": "ApexError",
+        "loop.loop": "Loop",
         "loop.result": "RunResult",
         "loop.sensor": "Sensor",
         "model.checkpoint": "load_model",

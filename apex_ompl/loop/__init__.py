@@ -9,6 +9,8 @@ from apex_ompl.util.lazy import lazy_names
 if TYPE_CHECKING:
     from apex_ompl.loop.environment import Environment as Environment
     from apex_ompl.loop.environment import Observation as Observation
+    from apex_ompl.loop.loop import Command as Command
+    from apex_ompl.loop.loop import Loop as Loop
     from apex_ompl.loop.result import Event as Event
     from apex_ompl.loop.result import Outcome as Outcome
     from apex_ompl.loop.result import RunResult as RunResult
@@ -17,5 +19,10 @@ if TYPE_CHECKING:
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
-    {"environment": "Environment Observation", "result": "Event Outcome RunResult", "sensor": "Sensor SensorStream"},
+    {
+        "environment": "Environment Observation",
+        "loop": "Command Loop",
+        "result": "Event Outcome RunResult",
+        "sensor": "Sensor SensorStream",
+    },  # fmt: skip
 )

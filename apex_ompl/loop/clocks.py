@@ -17,7 +17,8 @@ from itertools import count
 
 import numpy as np
 
-from apex_ompl.loop.cycle import Decided, Loop, RunRecord, undo
+from apex_ompl.loop.control import Decided, RunRecord, undo
+from apex_ompl.loop.cycle import Cycle
 from apex_ompl.loop.environment import Environment, Observation, ObservationSource
 from apex_ompl.loop.replanning import ImmediateReplanning, PlannerProcess
 from apex_ompl.loop.tracking import Tracker
@@ -41,7 +42,7 @@ def simulate(
         sensor: Observes the environment.
         seed: Seed of random choices.
     """
-    loop = Loop(environment, context, ImmediateReplanning(context, replanner), sensor, seed)
+    loop = Cycle(environment, context, ImmediateReplanning(context, replanner), sensor, seed)
     with running(loop.abort):
         for k in count():
             now, before = k * context.settings.period, Decided.of(loop.executor)
@@ -82,11 +83,9 @@ def undisturbed(core: int | None) -> Iterator[None]:
             gc.enable()
 
 
-def warm_up(context: RunContext, environment: Environment, seed: int) -> None:
-    """Call once what a step calls, so that compiled functions are loaded before the clock runs."""
-    present = tuple(environment.present(0.0)) or (
-        Obstacle(name="warm-up", box=(0.1, 0.1, 0.1), position=(9.0, 9.0, 9.0)),
-    )
+def warm_up(context: RunContext, seen: tuple[Obstacle, ...], seed: int) -> None:
+    """Call once what a step calls among obstacles, so that compiled functions are loaded before the clock runs."""
+    present = seen or (Obstacle(name="warm-up", box=(0.1, 0.1, 0.1), position=(9.0, 9.0, 9.0)),)
     tracker = Tracker(context.kernel)
     tracker.take(Observation(0.0, 0.0, tuple(standing(o) for o in present)))
     motion = time_path(np.stack([context.setup.start, context.goals[0]]), context.limits, context.names).trajectory
@@ -122,11 +121,11 @@ def run_in_real_time(
         decided in time.
     """
     period = context.settings.period
-    loop = Loop(environment, context, planner, sensor, seed, lead=period)
+    loop = Cycle(environment, context, planner, sensor, seed, lead=period)
     executor, ticks = loop.executor, list[float]()
     k, missed = 0, 0
     ended: RunRecord | None = None
-    warm_up(context, environment, seed)
+    warm_up(context, tuple(environment.present(0.0)), seed)
     with undisturbed(cores()[0]), running(loop.abort):
         started = time.perf_counter()
         while ended is None:

@@ -21,7 +21,6 @@ from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.timing import time_path
-from apex_ompl.util.process import one_torch_thread
 
 RADIUS, VELOCITY = 0.06, (0.02, 0.0, 0.0)  # of the obstacle in the way [m, m/s]
 LONG = 1.0  # time that a rehearsed replan may take by the compute-cost table [s]
@@ -77,7 +76,7 @@ def serve(connection: Connection[Any, Any]) -> None:
         connection.send(str(error))
         return
     connection.send("")
-    with quiet_ompl(), one_torch_thread():
+    with quiet_ompl():
         while True:
             data = connection.recv_bytes()
             budget = WallClockBudget(SHARE * work.settings.budget, connection.poll)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -12,12 +11,13 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.clocks import cores, run_in_real_time, simulate
-from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.environment import Environment
 from apex_ompl.loop.metrics import run_metrics
+from apex_ompl.loop.preparation import context_of, work_of
 from apex_ompl.loop.referee import judge
-from apex_ompl.loop.replan.methods import method_of, replanner_of
-from apex_ompl.loop.replanning import PlannerProcess, Work
+from apex_ompl.loop.replan.methods import method_of
+from apex_ompl.loop.replanning import PlannerProcess
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.compute_costs import cost_table
@@ -25,15 +25,13 @@ from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import Replanner
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
-from apex_ompl.ompl.setup import assemble
-from apex_ompl.robot.model import Limits, digest
+from apex_ompl.robot.model import digest
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
-from apex_ompl.timing import Timing, Trajectory
+from apex_ompl.timing import Trajectory
 from apex_ompl.util.validation import check_name, check_seed
 
 CLOCKS = ("sim", "real")
-SHARE = 1.0 - 1e-6  # of the limits that is used: pieces of motions are rounded where they are joined
 
 
 def run_in(
@@ -58,13 +56,8 @@ def run_in(
     environment.ran = True
     with quiet_ompl():
         seed_ompl(seed)
-        setup = assemble(environment.problem.still, seed=seed)
-        if setup.constraints is not None:
-            kept = f"the {setup.constraints.names[0]} along the path"
-            raise ParameterError("problem", kept, "no constraint: replanned motions would not keep it")
-        timing = Timing(velocity_scale=speed)
-        limits = timing.limits(setup.robot.limits, setup.robot.joint_names)
-        context = RunContext(setup, _within(limits), _within(setup.robot.limits), used)
+        context = context_of(environment.problem, used, speed, seed)
+        setup = context.setup
         noted = {"loop": asdict(used), "sensor": asdict(sensor), "speed": speed, "costs": cost_table()["version"]}
         run = _Run(environment, context, replanning.name, clock, seed, noted)
         fault = setup.start_fault
@@ -76,33 +69,13 @@ def run_in(
             return run.result(done, outcome, done.ended)
         stream = SensorStream(sensor, environment, used.watched)
         if clock == "real":
-            _check_pickles(method)
-            work = Work(
-                environment.problem.still, context.limits, context.stopping, used, replanner_of, (method,), seed,
-                rehearses=True,
-            )  # fmt: skip
-            with PlannerProcess(work, cores()[1]) as process:
+            with PlannerProcess(work_of(context, method, seed), cores()[1]) as process:
                 done = run_in_real_time(environment, context, process, stream, seed)
         else:
             replanner = replanning.make()
             replanner.prepare(context)
             done = simulate(environment, context, replanner, stream, seed)
     return run.judged(done)
-
-
-def _check_pickles(method: str | Replanner) -> None:
-    try:
-        pickle.dumps(method)
-    except Exception as error:
-        raise ParameterError(
-            "method", method, f"a replanner that can be pickled to another process: {type(error).__name__}: {error}"
-        ) from error
-
-
-def _within(limits: Limits) -> Limits:
-    """Return limits that leave room for rounding."""
-    some = {name: SHARE * getattr(limits, name) for name in ("velocity", "acceleration", "jerk")}
-    return replace(limits, **some)
 
 
 @dataclass(frozen=True, eq=False)

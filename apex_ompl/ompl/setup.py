@@ -25,6 +25,7 @@ from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import problem_at
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
 from apex_ompl.util.display import counted, one_line
 
 if TYPE_CHECKING:
@@ -257,7 +258,7 @@ def _stop_of(validator: MotionValidator) -> Callable[[], bool]:
 def _resting(constraints: ConstraintSet, start: Array, goals: Array, held: NDArray[np.intp]) -> NDArray[np.intp]:
     """Return the joints that stay: those that are held, and those out of reach of projection that no goal moves."""
     alike = [k for k in constraints.fixed if (goals[:, k] == start[k]).all()]
-    return np.union1d(held, np.array(alike, np.intp))
+    return distinct(np.append(held, np.array(alike, np.intp)))
 
 
 def _held_fault(robot: Robot, start: Array, goal: Array, held: NDArray[np.intp]) -> str:

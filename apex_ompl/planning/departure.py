@@ -77,7 +77,7 @@ def find_departure(setup: PlanningSetup, most: float, seed: int = 0) -> Departur
     if depth > most + ROUNDING or any(contact.depth > most + ROUNDING for contact in contacts):
         return None
     names = (contacts[0].first, contacts[0].second) if contacts else _nearest_pair(checker, start)
-    rng, free = np.random.default_rng(seed), np.setdiff1d(np.arange(len(start)), setup.held)
+    rng, free = np.random.default_rng(seed), np.delete(np.arange(len(start)), setup.held)
     drawn = np.zeros((DIRECTIONS, len(start)))
     drawn[:, free] = rng.normal(size=(DIRECTIONS, len(free)))
     uphill = _gradient(checker, start, free)

@@ -153,7 +153,7 @@ class MotionLimits:
             second: Derivatives q'', shape (n, dof) [1/rad].
         """
         n, limited = len(q), self._limited
-        chosen = np.unique(np.append(np.arange(0, n, POINTS_PER_ROW), n - 1))
+        chosen = distinct(np.append(np.arange(0, n, POINTS_PER_ROW), n - 1))
         between = np.arange(n)
         found = []
         for values in self.dynamics.along(q[chosen], first[chosen], second[chosen]) if len(limited) else ():

@@ -68,7 +68,7 @@ def knots(solution: ruckig.Trajectory) -> tuple[Array, Array, Array, Array]:
     changes = [0.0, solution.duration]
     for profile in solution.profiles[0]:
         changes += [*np.cumsum(profile.brake.t), *(profile.brake.duration + np.cumsum(profile.t))]
-    times = np.unique(np.clip(changes, 0.0, solution.duration))
+    times = distinct(np.clip(changes, 0.0, solution.duration))
     times = times[np.append(True, np.diff(times) > SHORTEST_PIECE)]
     if len(times) > 1:
         times[-1] = solution.duration

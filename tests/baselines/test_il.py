@@ -25,7 +25,7 @@ from apex_ompl.baselines.imitation.replanner import ImitationReplanner
 from apex_ompl.baselines.imitation.training import ImitationTrainer
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError
-from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.referee import RefereeReport
 from apex_ompl.loop.replan.methods import named
 from apex_ompl.loop.replanning import SHARE

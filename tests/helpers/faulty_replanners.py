@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from typing import Any
 
@@ -18,10 +19,11 @@ class Faulty:
     """A straight line, and then faults in turn, the last one for ever."""
 
     def __init__(self, *faults: str) -> None:
-        self.faults, self.calls = faults, 0
+        self.faults, self.calls, self.modules = faults, 0, set[str]()
 
     def prepare(self, context: RunContext) -> None:
         del context
+        self.modules = {*sys.modules}
 
     def replan(self, context: RunContext, request: Request, budget: ComputeBudget) -> Any:
         fault = ("", *self.faults)[min(self.calls, len(self.faults))]
@@ -37,6 +39,8 @@ class Faulty:
             time.sleep(0.001)
         if fault == "late":
             time.sleep(0.2)
+        if fault == "imports" and (new := {*sys.modules} - self.modules):
+            raise ValueError(f"imported since: {new}")
         if fault == "raises":
             raise ValueError("a bad number")
         if fault == "nonsense":

@@ -11,7 +11,7 @@ import numpy as np
 
 from apex_ompl import problems
 from apex_ompl.loop.clocks import simulate
-from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.referee import RefereeReport, judge
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.compute_costs import ComputeBudget

@@ -265,3 +265,9 @@ def _use_run() -> None:
     for name in ("run.npz", "run.json"):
         result.save(name)
         assert apex_ompl.RunResult.load(name).as_dict() == result.as_dict()
+    problem = apex_ompl.load_problem("vertical/free/1")
+    settings = apex_ompl.LoopSettings(error=0.01, fastest=0.3)
+    with apex_ompl.Loop(problem, settings=settings) as loop:
+        loop.observe(0.0, [])
+        command = loop.step(0.0, problem.start_state(loop.joint_names))
+        assert command is not None and command.rests and loop.outcome is None

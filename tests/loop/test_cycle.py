@@ -13,7 +13,8 @@ from loops import FAR, PROBLEM, ByHand, context_of, line, world_of
 from apex_ompl import run
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.clocks import simulate
-from apex_ompl.loop.cycle import Decided, Loop, RunRecord, undo
+from apex_ompl.loop.control import Decided, RunRecord, undo
+from apex_ompl.loop.cycle import Cycle
 from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.replanning import ImmediateReplanning
 from apex_ompl.loop.result import INTERRUPTED
@@ -26,13 +27,13 @@ from apex_ompl.timing.rests import is_at_rest
 PERIOD, NAN = LoopSettings.period, float("nan")
 
 
-def loop_of(replanner: Any, sensor: Sensor | None = None, **parameters: Any) -> Loop:
+def loop_of(replanner: Any, sensor: Sensor | None = None, **parameters: Any) -> Cycle:
     context, world = context_of(PROBLEM, **parameters), world_of(PROBLEM)
     eyes = SensorStream(sensor or Sensor(), world, context.settings.watched)
-    return Loop(world, context, ImmediateReplanning(context, replanner), eyes, seed=0)
+    return Cycle(world, context, ImmediateReplanning(context, replanner), eyes, seed=0)
 
 
-def steps(loop: Loop) -> Iterator[tuple[float, Decided, RunRecord | None]]:
+def steps(loop: Cycle) -> Iterator[tuple[float, Decided, RunRecord | None]]:
     """The time of each step, what had been decided before it, and what came of the run."""
     for k in range(2000):
         before = Decided.of(loop.executor)
@@ -210,18 +211,18 @@ def test_an_interrupt_stops_the_robot_and_returns_what_was_done_so_far(
     where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whatever of a step was done, it is undone; the next interrupt is raised."""
-    original = getattr(Loop, where)
+    original = getattr(Cycle, where)
     for count in (1, 2):
         left = [count]
 
-        def interrupted(loop: Loop, now: float, left: list[int] = left) -> Any:
+        def interrupted(loop: Cycle, now: float, left: list[int] = left) -> Any:
             found = original(loop, now)
             if now >= 0.4 and left[0]:
                 left[0] -= 1
                 raise KeyboardInterrupt
             return found
 
-        monkeypatch.setattr(Loop, where, interrupted)
+        monkeypatch.setattr(Cycle, where, interrupted)
         eyes = Changed(lambda k, one: one)
         if count == 2:
             with pytest.raises(KeyboardInterrupt):

@@ -12,7 +12,7 @@ from runs import motion_between
 
 from apex_ompl import problems, run
 from apex_ompl.errors import ApexError
-from apex_ompl.loop.cycle import RunRecord
+from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.referee import LIMIT_TOLERANCE
 from apex_ompl.loop.result import Outcome, RunResult
 from apex_ompl.loop.run import _Run

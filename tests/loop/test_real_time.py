@@ -21,7 +21,8 @@ from apex_ompl import run
 from apex_ompl.errors import PlannerProcessError
 from apex_ompl.loop import replanning
 from apex_ompl.loop.clocks import run_in_real_time
-from apex_ompl.loop.cycle import Loop, RunRecord
+from apex_ompl.loop.control import RunRecord
+from apex_ompl.loop.cycle import Cycle
 from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.planner_worker import rehearse
 from apex_ompl.loop.referee import RefereeReport, judge
@@ -103,16 +104,16 @@ def test_observations_may_be_late_doubled_out_of_order_or_no_numbers() -> None:
 
 @pytest.mark.parametrize("where", ["advance", "step", "announce_start"])
 def test_an_interrupt_stops_the_robot(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    original, left = getattr(Loop, where), [1]
+    original, left = getattr(Cycle, where), [1]
 
-    def interrupted(loop: Loop, now: float) -> Any:
+    def interrupted(loop: Cycle, now: float) -> Any:
         found = original(loop, now)
         if now >= 0.5 and left:
             left.pop()
             raise KeyboardInterrupt
         return found
 
-    monkeypatch.setattr(Loop, where, interrupted)
+    monkeypatch.setattr(Cycle, where, interrupted)
     done, report, process = go()
     assert done.ended == "aborted" and done.reason == INTERRUPTED and process.process.poll() is not None
     assert is_at_rest(done.trajectory, done.trajectory.duration) and done.trajectory.duration < 1.5
@@ -224,8 +225,23 @@ def test_a_request_ends_what_the_process_is_busy_with() -> None:
                 assert time.monotonic() < started + 60.0
                 reply = process.reply(0.0)
                 spent += [] if reply is None else [reply]
+                time.sleep(0.002)
     assert [one.number for one in spent] in ([1, 2, 3], [1, 3])
     assert all(one.answer.found is not None for one in spent) and spent[-2].answer.budget.spent < 8.0
+
+
+def test_a_ready_process_imports_nothing_more() -> None:
+    """An import of torch takes seconds, in which no replan is answered."""
+    context, world = context_of(PROBLEM, budget=10.0), world_of(PROBLEM)
+    work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, ("imports",), 0)
+    standing = Following.resting(context.setup.start, 0.0, context.names)
+    with PlannerProcess(work) as process:
+        for number in (1, 2):
+            assert process.submit(Request(number, 0.0, 1.0, standing, None, DynamicObstacles([]), 0.0, (), math.inf, 0))
+            reply, started = None, time.monotonic()
+            while reply is None and time.monotonic() < started + 60.0:
+                reply = process.reply(0.0)
+            assert reply is not None and reply.answer.found is not None, reply and reply.failed
 
 
 def test_a_process_that_reads_nothing_holds_nobody_up() -> None:
