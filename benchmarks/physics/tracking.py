@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from apex_ompl import plan, problems
 from apex_ompl.drivers import MujocoDriver
+from apex_ompl.drivers.library import mujoco
 from apex_ompl.drivers.twin import with_mass
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
@@ -137,7 +138,8 @@ def main() -> None:
         if found.unplanned and case.known
     ]
     data = {"cases": [{**vars(case), **vars(found)} for case, found in figures.items()]}
-    record.write("physics_tracking", data, "\n".join(lines).rstrip(), n=len(given.problems), seed=SEED)
+    settings = {"n": len(given.problems), "seed": SEED, "mujoco": mujoco().__version__}
+    record.write("physics_tracking", data, "\n".join(lines).rstrip(), **settings)
 
 
 if __name__ == "__main__":

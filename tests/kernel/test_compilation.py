@@ -70,24 +70,34 @@ def test_the_same_code_at_another_place_is_not_compiled_again(tmp_path: Path) ->
     assert "compiles" in here.stderr and "compiles" not in there.stderr
 
 
+DAMAGE = {"index_0": (".nbi", 0), "index_50": (".nbi", 50), "code_0": (".nbc", 0), "code_50": (".nbc", 50)}
+FOUR = """
+import numpy as np
+from apex_ompl.kernel.compiled import compilation
+""" + "".join(f"""
+def {name}(a):
+    return a[0] + 1.0
+
+if compilation.entry_point({name})(np.ones(1)) != 2.0:
+    raise SystemExit("{name}")
+""" for name in DAMAGE)  # fmt: skip
+
+
 def test_what_is_damaged_in_the_cache_is_compiled_anew(tmp_path: Path, script: Path) -> None:
+    """Each file that was cut short is told in one line, and is whole after that run."""
+    script.write_text(FOUR)
     called(script, tmp_path)
-    for ending in (".nbi", ".nbc"):
-        for size in (0, 50):
-            check_damaged(tmp_path, script, ending, size)
-
-
-def check_damaged(tmp_path: Path, script: Path, ending: str, size: int) -> None:
-    """A file of the cache that was cut short is told, and is whole after that run."""
-    (file,) = tmp_path.rglob(f"*plus*{ending}")
-    whole = file.read_bytes()
-    file.write_bytes(whole[:size])
+    whole = {}
+    for name, (ending, size) in DAMAGE.items():
+        (file,) = tmp_path.rglob(f"*{name}*{ending}")
+        whole[file] = file.read_bytes()
+        file.write_bytes(whole[file][:size])
     damaged, mended = called(script, tmp_path), called(script, tmp_path)
-    assert (
-        damaged.stderr.startswith("apex_ompl compiles plus: the file of its code in ")
-        and str(tmp_path) in damaged.stderr
-    )
-    assert damaged.stderr.count("\n") == 1 and mended.stderr == "" and len(file.read_bytes()) == len(whole)
+    lines = damaged.stderr.splitlines()
+    assert len(lines) == len(DAMAGE) and mended.stderr == ""
+    for name, line in zip(DAMAGE, lines, strict=True):
+        assert line.startswith(f"apex_ompl compiles {name}: the file of its code in ") and str(tmp_path) in line
+    assert all(len(file.read_bytes()) == len(content) for file, content in whole.items())
 
 
 READ_ONLY = """

@@ -68,13 +68,13 @@ def test_paths_of_control_points_are_those_of_the_spline() -> None:
 
 def test_the_variational_network_learns_to_give_paths_back() -> None:
     torch.manual_seed(0)
-    control = torch.tensor(some_paths().control()[::10][:64], dtype=torch.float32)
+    control = torch.tensor(some_paths().control()[::10][:32], dtype=torch.float32)
     model = VariationalLatent(Spline(), DOF, 8, 32)
     model.fit_scale(control)
     optimizer = torch.optim.Adam(model.parameters(), 2e-3)
     errors = []
     for k in range(120):
-        noise = torch.randn(64, *model.latent, generator=torch.Generator().manual_seed(k))
+        noise = torch.randn(len(control), *model.latent, generator=torch.Generator().manual_seed(k))
         loss, error = model.loss(control, noise, 1e-6)
         optimizer.zero_grad()
         loss.backward()

@@ -95,7 +95,7 @@ def test_estimates_of_a_model_that_pays_for_collisions_have_fewer(few: Path, tmp
     for weight in (0.0, 3.0):
         folder = tmp_path / f"{weight:g}"
         folder.mkdir()
-        trainer = Trainer(config(few, condition=CLEARANCES, steps=150, rate=3e-3, collision=weight), folder, HERE)
+        trainer = Trainer(config(few, condition=CLEARANCES, steps=100, rate=3e-3, collision=weight), folder, HERE)
         trainer.run()
         data, generator, network = trainer.data, torch.Generator().manual_seed(0), trainer.averaged_network()
         control, conditions = data.shard.batch(np.arange(len(data.shard)), generator)
@@ -132,7 +132,7 @@ def test_rows_logged_after_the_last_save_are_removed(paths: Paths, tmp_path: Pat
         trainer()
 
 
-def test_a_killed_command_is_resumed(few: Path, tmp_path: Path) -> None:
+def test_a_killed_command_is_resumed(few: Path, tmp_path: Path, script_here: Any) -> None:
     file = tmp_path / "small.yaml"
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 3000, "save_every": 0.05, "log_every": 500}))
     command = [sys.executable, str(SCRIPT), str(file), "--out", str(tmp_path / "run"), "--quiet"]
@@ -150,12 +150,12 @@ def test_a_killed_command_is_resumed(few: Path, tmp_path: Path) -> None:
     step = torch.load(state, weights_only=True)["step"]
     assert 0 < step < 3000
     load_torch_model(tmp_path / "run" / "checkpoint")
-    how: dict[str, Any] = {"env": environment, "capture_output": True, "text": True}
-    done = subprocess.run([*command, "--minutes", "0.01"], check=False, **how)
+    again = (SCRIPT.name, *command[2:])
+    done = script_here(*again, "--minutes", "0.01")
     assert done.returncode == 0, done.stderr
     assert torch.load(state, weights_only=True)["step"] > step
     assert [path.name for path in (tmp_path / "run").glob(".*")] == [".lock"]
-    same = subprocess.run([*command, "--set", "log_every=7", "--minutes", "0.001"], check=False, **how)
+    same = script_here(*again, "--set", "log_every=7", "--minutes", "0.001")
     assert same.returncode == 0, same.stderr  # it does not determine the weights
 
 

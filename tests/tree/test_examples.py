@@ -10,7 +10,7 @@ import pytest
 from support import ROOT
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-ARGUMENTS = {"06_ompl_benchmark": ("reach_past_post", "--runs", "1", "--timeout", "8")}
+ARGUMENTS = {"06_ompl_benchmark": ("reach_past_post", "--runs", "1", "--timeout", "3")}
 MOST_LINES = 40  # of an example of a part of one's own
 
 

@@ -173,22 +173,18 @@ def test_editing_in_the_page_changes_the_scene_and_plan_answers(driver: Any, tmp
         process.kill()
 
 
-def test_ctrl_c_leaves_nothing_running(driver: Any, tmp_path: Path) -> None:
+def test_ctrl_c_leaves_nothing_running(driver: Any, apex_cli: Any, tmp_path: Path) -> None:
     arm_problem(tmp_path).save(tmp_path / "p.yaml")
     page = str(tmp_path / "p.yaml"), "--port", "8391"
     process, where = started(*page)
     try:
         assert where == "http://127.0.0.1:8391"
-        taken = subprocess.run(
-            [*VIEW, *page, "--no-browser"], capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        taken = apex_cli("view", *page, "--no-browser")
         assert taken.returncode == 2 and taken.stderr.count("\n") == 1 and "8391" in taken.stderr
         opened(driver, where)
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 130
     finally:
         process.kill()
-    again, where = started(*page)
-    again.terminate()
-    again.wait(30)
-    assert where == "http://127.0.0.1:8391", "the port is free again"
+    with serving(8391) as server:
+        assert server.get_port() == 8391, "the port is free again"
