@@ -131,6 +131,10 @@ class PlannerProcessError(ApexError):
     """The process in which replans are made could not be made ready."""
 
 
+class DriverError(ApexError):
+    """A robot, or a controller of it, does not answer, or is not where it may be."""
+
+
 class RobotError(ApexError):
     """A robot description that is not valid."""
 

@@ -1,0 +1,27 @@
+"""Drivers: robots that follow motions, in physics or real."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from apex_ompl.util.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from apex_ompl.drivers.driver import Driver as Driver
+    from apex_ompl.drivers.driver import DriverState as DriverState
+    from apex_ompl.drivers.kinematic import KinematicDriver as KinematicDriver
+    from apex_ompl.drivers.mujoco import MujocoDriver as MujocoDriver
+    from apex_ompl.drivers.ros2 import Ros2Driver as Ros2Driver
+    from apex_ompl.drivers.twin import Twin as Twin
+    from apex_ompl.drivers.twin import TwinSettings as TwinSettings
+
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "driver": "Driver DriverState",
+        "kinematic": "KinematicDriver",
+        "mujoco": "MujocoDriver",
+        "ros2": "Ros2Driver",
+        "twin": "Twin TwinSettings",
+    },  # fmt: skip
+)

@@ -1,0 +1,107 @@
+"""A driver whose robot is exactly where it is commanded to be, on the wall clock or on a simulated one."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from apex_ompl.drivers.commands import START_TOLERANCE, Commands
+from apex_ompl.drivers.driver import DriverState
+from apex_ompl.errors import ParameterError
+from apex_ompl.robot.model import Robot
+from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array
+from apex_ompl.util.display import one_line
+from apex_ompl.util.validation import check_array, check_number, finite_array
+
+
+class KinematicDriver:
+    """A robot that is exactly where it is commanded to be.
+
+    Without a clock of the caller's its time stands still until :meth:`advance`. Its methods may be called from several
+    threads.
+
+    Attributes:
+        names: Names of the joints.
+        limits: Limits of the joints.
+    """
+
+    def __init__(
+        self, robot: Robot, state: Array | None = None, *, clock: Callable[[], float] | None = None,
+        tolerance: float = START_TOLERANCE,
+    ) -> None:  # fmt: skip
+        """Rest in a state.
+
+        Args:
+            robot: The robot.
+            state: The state, shape (dof,); by default the home of the robot.
+            clock: Returns the time, which never decreases [s], such as ``time.monotonic``.
+            tolerance: Largest distance of the start of a motion from the commanded position [rad].
+
+        Raises:
+            ParameterError: The state has another shape or a number that is not finite, or is outside the limits.
+        """
+        at = finite_array(robot.home if state is None else state, "state")
+        check_array(at, (robot.dof,), "state")
+        self.names, self.limits = robot.joint_names, robot.limits
+        self._commands = Commands(self.names, self.limits, at, tolerance)
+        fault = robot.limit_fault(at)
+        if fault:
+            raise ParameterError("state", fault, "a state within the limits")
+        self._clock, self._time, self._closed = clock, 0.0, False
+        self._lock = threading.Lock()
+
+    def __repr__(self) -> str:
+        """Return the time, and whether the driver is closed."""
+        return one_line("KinematicDriver", f"{self.time:.3f} s", "closed" if self._closed else "")
+
+    @property
+    def time(self) -> float:
+        """Time on the driver's clock [s]."""
+        return self._time if self._clock is None else self._clock()
+
+    @property
+    def end(self) -> float:
+        """Time from which on rest is commanded [s]."""
+        return self._commands.end
+
+    def advance(self, until: float) -> None:
+        """Let the simulated clock go on to a time [s].
+
+        Raises:
+            ParameterError: The time is over, or the clock is the caller's.
+        """
+        check_number(until, "until", self._time, math.inf)
+        if self._clock is not None:
+            raise ParameterError("until", until, "no call: the clock is the caller's")
+        self._time = until
+
+    def state(self) -> DriverState:
+        """Return the commanded state."""
+        with self._open():
+            now = self.time
+            self._commands.forget(now)
+            position, velocity, _ = self._commands.states(np.array([now]))[:, 0]
+            return DriverState(now, position, velocity)
+
+    def send(self, motion: Trajectory, at: float) -> None:
+        """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
+        with self._open():
+            self._commands.send(motion, at, self.time)
+
+    def stop(self) -> None:
+        """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
+        with self._open():
+            self._commands.stop(self.time)
+
+    def close(self) -> None:
+        """End it; other calls after it raise an ApexError."""
+        self._closed = True
+
+    def _open(self) -> threading.Lock:
+        if self._closed:
+            raise ParameterError("driver", "one that was closed", "an open one")
+        return self._lock

@@ -1,0 +1,46 @@
+"""The optional libraries: MuJoCo, and the client library of ROS 2."""
+
+from __future__ import annotations
+
+import os
+from ctypes.util import find_library
+from importlib import import_module
+from types import SimpleNamespace
+from typing import Any
+
+from apex_ompl.errors import MissingFileError
+from apex_ompl.util.forking import unforked
+
+
+def mujoco() -> Any:
+    """Return the module ``mujoco``, set up to draw by EGL or OSMesa on a machine without a display.
+
+    Raises:
+        MissingFileError: The extra ``twin`` is not installed.
+    """
+    if not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl" if find_library("EGL") else "osmesa")  # which is read at the import
+    try:
+        with unforked():
+            return import_module("mujoco")
+    except ImportError as error:
+        raise MissingFileError("mujoco", "package for physics", "install the extra: apex-ompl[twin]") from error
+
+
+def rclpy() -> Any:
+    """Return what drivers use of ``rclpy`` and of messages, as one namespace.
+
+    Raises:
+        MissingFileError: The extra ``ros2`` is not installed, nor a ROS 2 of the system sourced.
+    """
+    places = {
+        "rclpy": ("Context", "init", "create_node"), "rclpy.executors": ("SingleThreadedExecutor",),
+        "rclpy.qos": ("qos_profile_sensor_data",), "rclpy.time": ("Time",), "sensor_msgs.msg": ("JointState",),
+        "trajectory_msgs.msg": ("JointTrajectory", "JointTrajectoryPoint"),
+    }  # fmt: skip
+    try:
+        with unforked():
+            found = {name: getattr(import_module(module), name) for module, names in places.items() for name in names}
+    except ImportError as error:
+        raise MissingFileError("rclpy", "package for ROS 2", "install the extra: apex-ompl[ros2]") from error
+    return SimpleNamespace(**found)

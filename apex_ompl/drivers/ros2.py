@@ -1,0 +1,238 @@
+"""A driver over ROS 2: motions go to joint trajectory controllers, and the state comes from their joint states.
+
+Each controller gets its joints of a motion as ``trajectory_msgs/JointTrajectory`` with positions, velocities and
+accelerations, whose header says when it starts. A ``joint_trajectory_controller`` follows its quintic polynomials
+between the points, which are the motion itself, and from then on in place of the trajectory before (parameter
+``allow_trajectory_replacement`` where there is one). As the motion starts in the state that is commanded then, there is
+nothing for the controller to bridge.
+"""
+
+from __future__ import annotations
+
+import atexit
+import threading
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.drivers.commands import START_TOLERANCE, Commands
+from apex_ompl.drivers.driver import DriverState
+from apex_ompl.drivers.library import rclpy
+from apex_ompl.errors import DriverError, ParameterError
+from apex_ompl.robot.model import Robot
+from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
+from apex_ompl.util.display import one_line
+from apex_ompl.util.validation import check_positive
+
+NANOSECONDS = 10**9
+LEAD = 0.03  # after which a stop starts [s]
+SILENCE = 0.5  # age of the state after which the robot counts as silent [s]
+STARTED = 10.0  # time to wait for controllers and the first state [s]
+SPUN = 0.05  # longest time between two looks at whether to end [s]
+DEPTH = 10  # messages that are kept
+
+
+class Ros2Driver:
+    """A robot behind joint trajectory controllers of ROS 2.
+
+    Its clock is that of its node, from the start of the driver on. Messages are taken in a thread of its own.
+
+    Attributes:
+        names: Names of the joints.
+        limits: Limits of the joints.
+        controllers: Names of the joints that each controller moves, by its name.
+    """
+
+    def __init__(
+        self, robot: Robot, controllers: Mapping[str, Sequence[str]] | str, *, renamed: Mapping[str, str] | None = None,
+        states: str = "/joint_states", node: str = "apex_ompl", lead: float = LEAD, silence: float = SILENCE,
+        tolerance: float = START_TOLERANCE, started: float = STARTED,
+    ) -> None:  # fmt: skip
+        """Wait for the controllers and the first joint states, in which the robot is taken to rest.
+
+        Args:
+            robot: The robot.
+            controllers: The joints that each controller moves, by its name, together all of them; or the name of the
+                one that moves them all. Trajectories go to the topic ``/NAME/joint_trajectory``.
+            renamed: Names of joints in ROS where they are others, by ours.
+            states: Topic of the joint states.
+            node: Name of the node.
+            lead: Time after which a stop starts, in which its message arrives [s].
+            silence: Age of the state after which :meth:`state` says that the robot is silent [s].
+            tolerance: Largest distance of the start of a motion from the commanded position [rad].
+            started: Time to wait for controllers and states [s].
+
+        Raises:
+            MissingFileError: The extra ``ros2`` is not installed.
+            ParameterError: A joint has no controller, or more than one, or is unknown, or a number is not positive.
+            DriverError: A controller or the joint states did not appear, or the robot is outside its limits.
+        """
+        ros = rclpy()
+        for name, value in {"lead": lead, "silence": silence, "started": started}.items():
+            check_positive(value, name)
+        self.names, self.limits = robot.joint_names, robot.limits
+        one = {controllers: self.names} if isinstance(controllers, str) else dict(controllers)
+        self.controllers = {name: tuple(joints) for name, joints in one.items()}
+        _check_joints(self.controllers, self.names)
+        renamed = dict(renamed or {})
+        unknown = sorted({*renamed} - {*self.names})
+        if unknown:
+            raise ParameterError("renamed", unknown[0], f"joints of {robot.name}")
+        self._ros_names = {name: renamed.get(name, name) for name in self.names}
+        self._lead, self._silence, self._closed = lead, silence, False
+        self._lock, self._arrived = threading.Lock(), threading.Condition()
+        self._measured: tuple[int, Array, Array] | None = None
+        self._seen: dict[str, tuple[int, float, float]] = {}
+        self._context = ros.Context()
+        ros.init(context=self._context)
+        atexit.register(self.close)  # a thread that still spins then would crash the process
+        try:
+            self._node = ros.create_node(node, context=self._context)
+            self._zero = self._node.get_clock().now().nanoseconds
+            self._publishers = {
+                name: self._node.create_publisher(ros.JointTrajectory, f"/{name}/joint_trajectory", DEPTH)
+                for name in self.controllers
+            }
+            self._node.create_subscription(ros.JointState, states, self._take, ros.qos_profile_sensor_data)
+            self._executor = ros.SingleThreadedExecutor(context=self._context)
+            self._executor.add_node(self._node)
+            self._thread = threading.Thread(target=self._spin, daemon=True)
+            self._thread.start()
+            start = self._first_state(states, started)
+            fault = robot.limit_fault(start)
+            if fault:
+                raise DriverError(f"the robot is outside its limits: {fault}")
+        except BaseException:
+            self.close()
+            raise
+        self._message, self._point, self._ros_time = ros.JointTrajectory, ros.JointTrajectoryPoint, ros.Time
+        self._commands = Commands(self.names, self.limits, start, tolerance)
+
+    def __repr__(self) -> str:
+        """Return the controllers, and whether the driver is closed."""
+        return one_line("Ros2Driver", ", ".join(self.controllers), "closed" if self._closed else "")
+
+    @property
+    def time(self) -> float:
+        """Time on the node's clock since the start of the driver [s]."""
+        return float((self._node.get_clock().now().nanoseconds - self._zero) / NANOSECONDS)
+
+    @property
+    def end(self) -> float:
+        """Time from which on rest is commanded [s]."""
+        return self._commands.end
+
+    def state(self) -> DriverState:
+        """Return the last measured state.
+
+        Raises:
+            DriverError: It is older than ``silence``.
+        """
+        self._check_open()
+        with self._arrived:
+            assert self._measured is not None
+            stamp, positions, velocities = self._measured
+        at = (stamp - self._zero) / NANOSECONDS
+        age = self.time - at
+        if age > self._silence:
+            raise DriverError(f"there were no joint states for {age:.3g} s")
+        return DriverState(at, positions, velocities)
+
+    def send(self, motion: Trajectory, at: float) -> None:
+        """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
+        self._check_open()
+        with self._lock:
+            self._send(motion, at, self.time)
+
+    def stop(self) -> None:
+        """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
+        self._check_open()
+        with self._lock:
+            now = self.time
+            start = now + self._lead
+            rest = self._commands.stopping(start)
+            self._send(rest, start, now)
+
+    def close(self) -> None:
+        """Leave the robot to the motion that it follows, which ends at rest, and end the node."""
+        if self._closed:
+            return
+        self._closed = True
+        atexit.unregister(self.close)
+        if hasattr(self, "_thread"):
+            self._thread.join()
+            self._executor.shutdown()
+        if hasattr(self, "_node"):
+            self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ParameterError("driver", "one that was closed", "an open one")
+
+    def _spin(self) -> None:
+        while not self._closed:
+            self._executor.spin_once(timeout_sec=SPUN)
+
+    def _first_state(self, states: str, started: float) -> Array:
+        """Wait for all controllers and a state of all joints, and return it, shape (dof,)."""
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._measured is not None, started)
+            measured = self._measured
+        if measured is None:
+            missing = [name for name, other in self._ros_names.items() if other not in self._seen]
+            raise DriverError(f"no state of {', '.join(missing)} came on {states} in {started:g} s")
+        for name, publisher in self._publishers.items():
+            with self._arrived:
+                if not self._arrived.wait_for(partial(_is_heard, publisher), started):
+                    raise DriverError(f"no controller listens to /{name}/joint_trajectory")
+        return measured[1]
+
+    def _take(self, message: Any) -> None:
+        """Take joint states, of all joints or of some."""
+        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        speeds = message.velocity or [0.0] * len(message.name)
+        for name, position, velocity in zip(message.name, message.position, speeds, strict=False):
+            if np.isfinite(position) and np.isfinite(velocity):
+                self._seen[name] = (stamp, position, velocity)
+        rows = [self._seen.get(other) for other in self._ros_names.values()]
+        with self._arrived:
+            if all(row is not None for row in rows):
+                found = np.array([row[1:] for row in rows if row is not None])
+                self._measured = min(row[0] for row in rows if row is not None), found[:, 0], found[:, 1]
+            self._arrived.notify_all()
+
+    def _send(self, motion: Trajectory, at: float, now: float) -> None:
+        self._commands.send(motion, at, now)
+        self._commands.forget(now)
+        start = self._zero + round(at * NANOSECONDS)
+        ticks = distinct(np.round(motion.times * NANOSECONDS).astype(np.int64))
+        states = motion.states(np.minimum(ticks / NANOSECONDS, motion.duration))
+        for controller, joints in self.controllers.items():
+            columns = [self.names.index(name) for name in joints]
+            message = self._message(joint_names=[self._ros_names[name] for name in joints])
+            message.header.stamp = self._ros_time(nanoseconds=start).to_msg()
+            for tick, (q, v, a) in zip(ticks.tolist(), np.moveaxis(states[:, :, columns], 1, 0).tolist(), strict=True):
+                point = self._point(positions=q, velocities=v, accelerations=a)
+                point.time_from_start.sec, point.time_from_start.nanosec = divmod(tick, NANOSECONDS)
+                message.points.append(point)
+            self._publishers[controller].publish(message)
+
+
+def _is_heard(publisher: Any) -> bool:
+    return bool(publisher.get_subscription_count() > 0)
+
+
+def _check_joints(controllers: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> None:
+    """Check that each joint has one controller."""
+    given = [joint for joints in controllers.values() for joint in joints]
+    for joint in given:
+        if joint not in names:
+            raise ParameterError("controllers", joint, f"joints of the robot: {', '.join(names)}")
+    for name in names:
+        if given.count(name) != 1:
+            raise ParameterError("controllers", f"{given.count(name)} for {name}", "one controller for each joint")

@@ -1,0 +1,485 @@
+"""A model in MuJoCo of a robot with its fixtures, the obstacles of a problem, and the objects that it holds.
+
+Kinematics, masses and inertias of the links are those of the URDF, and geometry that of the collision checker. Pairs of
+links that the checker does not check do not collide. Joints that mimic others follow them by equality constraints. The
+motors of the planned joints are driven by torque, and compensate the gravity of the links. The effort of
+a robot file limits the torque at the link, as the limits of a Panda do, whose sensors are behind the gears: what the
+rotor and the friction of a joint need at its limits of acceleration and velocity, its motor gives in addition. Held
+objects are free bodies, welded to the link that holds them.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, count
+from typing import Any
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.collision.mass import held_load
+from apex_ompl.collision.shapes import coal_geometry
+from apex_ompl.drivers.geoms import geom_shapes
+from apex_ompl.drivers.library import mujoco
+from apex_ompl.errors import ParameterError, RobotError
+from apex_ompl.robot.dynamics import Load
+from apex_ompl.robot.model import Robot, link_of
+from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.scripts import is_there, place_at
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_name, check_number, check_positive, finite_numbers
+
+PANDA_EFFORT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # by which the joints of a Panda are known [Nm]
+PANDA_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)  # of MuJoCo Menagerie [Nm/rad]
+BANDWIDTH = 60.0  # natural frequency of the servos of other joints [rad/s]
+FOLLOWER_ARMATURE, FOLLOWER_DAMPING = 1e-4, 5e-3  # of joints that mimic others
+LEADER_ARMATURE, LEADER_DAMPING = 0.02, 0.05  # of joints that others mimic, such as the synergy of a hand
+LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-6  # of links that move and have none in the URDF [kg, kg m^2]
+SOFT_CONTACT = {"solref": [0.004, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
+RIGID = {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 0.001, 0.5, 2.0]}  # of mimic joints and welds
+SOLIDS, FALLING = 1, 2  # bits by which geoms collide: the floor is touched by held objects only
+PAYLOAD_RADIUS = 0.03  # of the ball that a payload is [m]
+AWAY = np.array([0.0, 0.0, -1000.0])  # where obstacles are that have not appeared [m]
+COLORS = {
+    "link": (0.85, 0.86, 0.88, 1.0), "fixture": (0.79, 0.65, 0.49, 1.0), "obstacle": (0.78, 0.33, 0.24, 1.0),
+    "held": (0.16, 0.62, 0.56, 1.0), "floor": (0.93, 0.93, 0.91, 1.0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TwinSettings:
+    """Settings of a twin. What a robot file does not say is assumed.
+
+    Attributes:
+        step: Time step [s].
+        gains: Joint name -> stiffness kp [Nm/rad] and damping kd [Nm s/rad] of its servo. By default kp is that of
+            Menagerie for the joints of a Panda; for other joints it is m w^2, with w = 60 rad/s and the inertia m of
+            the joint in the home state. The damping is critical, kd = 2 sqrt(kp m).
+        armature: Inertia of the rotor of each joint, at the joint [kg m^2].
+        damping: Viscous friction of each joint [Nm s/rad].
+        friction: Coefficient of friction of all surfaces.
+        density: Density of held objects without a mass [kg/m^3].
+        floor: Height of the floor, which only objects that fall can touch [m].
+    """
+
+    step: float = 0.001
+    gains: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    armature: float = 0.1
+    damping: float = 1.0
+    friction: float = 0.8
+    density: float = 300.0
+    floor: float = -0.75
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            ParameterError: A number is out of its range.
+        """
+        for name in ("step", "armature", "density"):
+            check_positive(getattr(self, name), name)
+        for name in ("damping", "friction"):
+            check_number(getattr(self, name), name, 0.0)
+        finite_numbers({"floor": self.floor}, "settings")
+        for joint, pair in self.gains.items():
+            if len(pair) != 2 or not all(math.isfinite(gain) and gain > 0.0 for gain in pair):
+                raise ParameterError(f"gains.{joint}", pair, "a stiffness and a damping, both positive")
+
+
+@dataclass(frozen=True)
+class Mimic:
+    """A joint that follows another one: q = multiplier * q_leader + offset."""
+
+    joint: str
+    leader: str
+    multiplier: float
+    offset: float
+
+
+def mimic_joints(urdf: str) -> tuple[Mimic, ...]:
+    """Return the joints of a URDF that mimic others, each with a leader that mimics none."""
+    found = {}
+    for joint in ET.fromstring(urdf).findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None and joint.get("type") != "fixed":
+            name, leader = str(joint.get("name")), str(mimic.get("joint"))
+            found[name] = Mimic(name, leader, float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0)))
+    for name, own in list(found.items()):
+        chain = own
+        while (over := found.get(chain.leader)) is not None:
+            m, b = chain.multiplier, chain.offset
+            chain = Mimic(name, over.leader, m * over.multiplier, m * over.offset + b)
+        found[name] = chain
+    return tuple(found.values())
+
+
+class Twin:
+    """A compiled model, and where the joints, motors and bodies of the robot and the problem are in it.
+
+    Attributes:
+        robot: The robot.
+        problem: The problem, or None.
+        settings: The settings.
+        mimics: Joints that mimic others.
+        loads: Masses that the robot holds, for inverse dynamics.
+        held: Held objects.
+        moving: Obstacles that move or appear.
+        model: The ``MjModel``.
+        q: Places of the planned joints in ``qpos``, shape (dof,).
+        v: The same in ``qvel``.
+        u: The same in ``ctrl``.
+        kp: Stiffness of the servos, shape (dof,) [Nm/rad].
+        kd: Damping of the servos, shape (dof,) [Nm s/rad].
+        motor_torque: Largest torques of the motors, shape (dof,) [Nm].
+        names: Names of the bodies in their order.
+    """
+
+    def __init__(self, robot: Robot, problem: Problem | None = None, settings: TwinSettings | None = None) -> None:
+        """Build the model.
+
+        Raises:
+            MissingFileError: The extra ``twin`` is not installed, or the file of a shape cannot be read.
+            UnknownNameError: There is no joint of the gains, or no link that holds an object or a payload.
+            SceneError: A shape has no counterpart in MuJoCo.
+            RobotError: MuJoCo cannot make a model of the robot, or one without all mimic joints.
+        """
+        self._mj, self._numbers = mujoco(), count()
+        self.robot, self.problem, self.settings = robot, problem, settings or TwinSettings()
+        self.mimics = mimic_joints(robot.urdf)
+        scene = problem.scene if problem else ()
+        self.held: tuple[AttachedObject, ...] = problem.attached if problem else ()
+        self.moving: tuple[Obstacle, ...] = tuple(one for one in scene if one.moving)
+        self.loads = held_loads(robot, problem, self.settings) if problem else ()
+        self.model = self._compiled(scene)
+        model = self.model
+        joints = [model.joint(name) for name in robot.joint_names]
+        self.q = np.array([joint.qposadr[0] for joint in joints])
+        self.v = np.array([joint.dofadr[0] for joint in joints])
+        self.u = np.array([model.actuator(name).id for name in robot.joint_names])
+        gains = servo_gains(robot, self.settings)
+        self.kp, self.kd = np.array([gains[name] for name in robot.joint_names]).T
+        self.names = tuple(str(model.body(k).name) for k in range(model.nbody))
+        self._followers = np.array([model.joint(one.joint).qposadr[0] for one in self.mimics], np.intp)
+        self._leaders = np.array([model.joint(one.leader).qposadr[0] for one in self.mimics], np.intp)
+        self._line = np.array([(one.multiplier, one.offset) for one in self.mimics]).reshape(-1, 2)
+        self._mocap = {one.name: int(model.body(one.name).mocapid[0]) for one in self.moving}
+        limited = model.jnt_actfrclimited[[joint.id for joint in joints]].astype(bool)
+        self.motor_torque = np.where(limited, model.jnt_actfrcrange[[joint.id for joint in joints], 1], np.inf)
+        self._compensated = model.jnt_actgravcomp[[joint.id for joint in joints]].astype(float)
+
+    @property
+    def rotor_inertia(self) -> Array:
+        """Inertia of rotors at each planned joint, with those of joints that mimic it, shape (dof,) [kg m^2]."""
+        return self._with_followers(self.model.dof_armature)
+
+    @property
+    def friction(self) -> Array:
+        """Viscous friction of each planned joint, with that of joints that mimic it, shape (dof,) [Nm s/rad]."""
+        damping = self.model.dof_damping
+        return self._with_followers(damping if damping.ndim == 1 else damping[:, 0])
+
+    def _with_followers(self, values: Array) -> Array:
+        found = np.array(values[self.v])
+        for one in self.mimics:
+            k = self.robot.joint_names.index(one.leader)
+            found[k] += one.multiplier**2 * values[self.model.joint(one.joint).dofadr[0]]
+        return found
+
+    def data(self, state: Array, time: float = 0.0) -> Any:
+        """Return an ``MjData`` with the robot at rest in a state, shape (dof,), with what it holds, at a time [s]."""
+        data = self._mj.MjData(self.model)
+        self.place(data, state, time)
+        return data
+
+    def place(self, data: Any, state: Array, time: float = 0.0) -> None:
+        """Put the robot into a state, shape (dof,), with what it holds, and the obstacles to a time [s]."""
+        data.time, data.qvel[:] = time, 0.0
+        data.qpos[self.q], data.ctrl[self.u] = state, 0.0
+        data.qpos[self._followers] = self._line[:, 0] * data.qpos[self._leaders] + self._line[:, 1]
+        for one in self.held:
+            self._set_free(data, one.name, self.robot.link_pose(state, one.link) @ one.pose)
+        self.move_obstacles(data, time)
+        self._mj.mj_forward(self.model, data)
+
+    def move_obstacles(self, data: Any, time: float) -> None:
+        """Put the obstacles that move to where they are at a time [s]; those that have not appeared are far below."""
+        for one in self.moving:
+            data.mocap_pos[self._mocap[one.name]] = place_at(one, time) if is_there(one, time) else AWAY
+
+    def step(self, data: Any) -> None:
+        """Simulate one step."""
+        self._mj.mj_step(self.model, data)
+
+    def asked_torques(self, data: Any) -> Array:
+        """Return the torques that the motors and the compensation of gravity ask for, shape (dof,) [Nm]."""
+        return np.asarray(data.actuator_force[self.u] + self._compensated * data.qfrc_gravcomp[self.v])
+
+    def renderer(self, width: int, height: int) -> Any:
+        """Return a ``mujoco.Renderer``."""
+        size = self.model.vis.global_
+        size.offwidth, size.offheight = max(size.offwidth, width), max(size.offheight, height)
+        return self._mj.Renderer(self.model, height, width)
+
+    def camera(self, azimuth: float, elevation: float, distance: float, center: Sequence[float]) -> Any:
+        """Return a camera that looks at a point [m] from a distance [m], by angles in degrees."""
+        camera = self._mj.MjvCamera()
+        camera.azimuth, camera.elevation, camera.distance, camera.lookat[:] = azimuth, elevation, distance, center
+        return camera
+
+    def pose(self, data: Any, name: str) -> Array:
+        """Return the pose of a link, an obstacle or a held object in the world, shape (4, 4) [m].
+
+        Raises:
+            UnknownNameError: There is no such body.
+        """
+        check_name(name, "body", self.names)
+        found = np.eye(4)
+        body = data.body(name)
+        found[:3, :3], found[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+        return found
+
+    def contacts(self, data: Any) -> dict[tuple[str, str], float]:
+        """Return the pairs of bodies that touch by their names, and how deep [m]; the floor is ``world``.
+
+        Pairs that may touch are left out.
+        """
+        if not data.ncon:
+            return {}
+        found: dict[tuple[str, str], float] = {}
+        bodies = self.model.geom_bodyid[data.contact.geom]
+        for (first, second), distance in zip(bodies.tolist(), data.contact.dist.tolist(), strict=True):
+            a, b = sorted((self.names[first], self.names[second]))
+            found[a, b] = max(found.get((a, b), 0.0), -distance)
+        return found
+
+    def _set_free(self, data: Any, name: str, pose: Array) -> None:
+        at = self.model.joint(name).qposadr[0]
+        data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = pose[:3, 3], _quaternion(pose)
+
+    def _compiled(self, scene: Sequence[Obstacle]) -> Any:
+        spec = self._skeleton()
+        self._add_links(spec)
+        self._add_joints(spec)
+        for fixture in self.robot.fixtures:
+            self._add_static(spec, fixture, "fixture")
+        for obstacle in scene:
+            self._add_static(spec, obstacle, "obstacle")
+        for held in self.held:
+            self._add_held(spec, with_mass(held, self.settings.density))
+        for load in payloads(self.robot, self.problem) if self.problem else ():
+            self._add_payload(spec, load)
+        self._add_exclusions(spec)
+        self._add_surroundings(spec)
+        try:
+            model = spec.compile()
+        except ValueError as error:
+            reason = " ".join(str(error).split())
+            raise RobotError(f"MuJoCo cannot make a model of {self.robot.name} ({reason})") from error
+        joints = int(np.sum(model.eq_type == self._mj.mjtEq.mjEQ_JOINT))
+        if joints != len(self.mimics):
+            raise RobotError(f"MuJoCo has {joints} equalities for the {len(self.mimics)} mimic joints of the URDF")
+        return model
+
+    def _skeleton(self) -> Any:
+        """Return the links and joints of the URDF, without geometry."""
+        root = ET.fromstring(self.robot.urdf)
+        for link in root.findall("link"):
+            for kind in ("visual", "collision"):
+                for element in link.findall(kind):
+                    link.remove(element)
+        mj = self._mj
+        try:
+            spec = mj.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
+        except ValueError as error:
+            raise RobotError(f"MuJoCo cannot read the URDF of {self.robot.name} ({error})") from error
+        spec.compiler.fusestatic = False  # else links on fixed joints vanish
+        spec.compiler.discardvisual = False  # else the background does
+        spec.compiler.inertiafromgeom = mj.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        option = spec.option
+        option.timestep, option.integrator = self.settings.step, mj.mjtIntegrator.mjINT_IMPLICITFAST
+        option.cone, option.impratio = mj.mjtCone.mjCONE_ELLIPTIC, 10.0  # else grasped objects creep
+        option.disableflags |= mj.mjtDisableBit.mjDSBL_FILTERPARENT  # the robot's own pairs count
+        return spec
+
+    def _add_links(self, spec: Any) -> None:
+        """Add the geometry of the links, and masses of moving links that have none."""
+        robot, frames = self.robot, self.robot.model.frames
+        for item in robot.geometry.geometryObjects:
+            frame = frames[item.parentFrame]
+            pose = (frame.placement.inverse() * item.placement).homogeneous
+            self._add_geoms(spec, spec.body(frame.name), item.geometry, pose, "link")
+        for body in spec.bodies:
+            body.gravcomp = 1.0
+            if list(body.joints) and not body.mass > 0.0:
+                body.mass, body.inertia, body.explicitinertial = LEAST_MASS, [LEAST_INERTIA] * 3, True
+                body.ipos = np.zeros(3)
+
+    def _add_joints(self, spec: Any) -> None:
+        """Set up joints, motors and the equalities of mimic joints."""
+        mj, settings, robot = self._mj, self.settings, self.robot
+        for name in settings.gains:
+            check_name(name, "joint", robot.joint_names)
+        for equality in list(spec.equalities):  # some versions make them of a URDF, some do not
+            spec.delete(equality)
+        leaders, followers = {one.leader for one in self.mimics}, {one.joint for one in self.mimics}
+        effort = dict(zip(robot.joint_names, robot.effort.tolist(), strict=True))
+        for joint in spec.joints:
+            name = joint.name
+            joint.armature, damping = settings.armature, settings.damping
+            if name in leaders:
+                joint.armature, damping = LEADER_ARMATURE, LEADER_DAMPING
+            elif name in followers:
+                joint.armature, damping = FOLLOWER_ARMATURE, FOLLOWER_DAMPING
+            joint.damping = [damping, 0.0, 0.0] if np.ndim(joint.damping) else damping
+            joint.actfrclimited = int(math.isfinite(effort.get(name, math.inf)))
+            joint.limited = int(name in effort)
+            if name not in effort:
+                continue
+            k = robot.joint_names.index(name)
+            own = joint.armature * robot.limits.acceleration[k] + damping * robot.limits.velocity[k]
+            most = effort[name] + own if joint.actfrclimited else 0.0
+            joint.actfrcrange = [-most, most]
+            joint.actgravcomp = name not in leaders
+            spec.add_actuator(name=name, trntype=mj.mjtTrn.mjTRN_JOINT, target=name)  # a motor of gear 1
+        for one in self.mimics:
+            line = [one.offset, one.multiplier, 0.0, 0.0, 0.0]
+            added = spec.add_equality(name=one.joint, type=mj.mjtEq.mjEQ_JOINT, objtype=mj.mjtObj.mjOBJ_JOINT)
+            added.name1, added.name2, added.data[:5] = one.joint, one.leader, line
+            added.solref, added.solimp = RIGID["solref"], RIGID["solimp"]
+
+    def _add_static(self, spec: Any, body: Body, role: str) -> None:
+        """Add a fixture or an obstacle; one that moves or appears is a mocap body."""
+        added = spec.worldbody.add_body(name=body.name, pos=body.position, quat=_quaternion(body.pose))
+        added.mocap = isinstance(body, Obstacle) and body.moving
+        self._add_geoms(spec, added, coal_geometry(body), np.eye(4), role)
+
+    def _add_held(self, spec: Any, held: AttachedObject) -> None:
+        """Add a held object: a free body, welded to the link that holds it."""
+        mj = self._mj
+        self.robot.link_frame(held.link)
+        added = spec.worldbody.add_body(name=held.name)
+        added.add_freejoint(name=held.name)
+        load = held_load(held.model_copy(update={"position": (0.0, 0.0, 0.0), "orientation": (0.0, 0.0, 0.0, 1.0)}))
+        assert load is not None
+        added.mass, added.ipos, added.explicitinertial = load.mass, load.center, True
+        added.fullinertia = load.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+        self._add_geoms(spec, added, coal_geometry(held), np.eye(4), "held")
+        weld = spec.add_equality(name=held.name, type=mj.mjtEq.mjEQ_WELD, objtype=mj.mjtObj.mjOBJ_BODY)
+        weld.name1, weld.name2, weld.active = held.link, held.name, True
+        weld.data[:11] = [0.0, 0.0, 0.0, *held.position, *_quaternion(held.pose), 1.0]
+        weld.solref, weld.solimp = RIGID["solref"], RIGID["solimp"]
+
+    def _add_payload(self, spec: Any, load: Load) -> None:
+        """Add the mass of a payload, which has no shape."""
+        added = spec.body(load.link).add_body(name=f"payload {next(self._numbers)}", pos=load.center)
+        added.mass, added.inertia, added.explicitinertial = load.mass, np.diag(load.inertia), True
+        added.ipos = np.zeros(3)  # else it counts twice
+
+    def _add_geoms(
+        self, spec: Any, body: Any, geometry: coal.CollisionGeometry, pose: Array, role: str
+    ) -> None:  # fmt: skip
+        friction, bits = [self.settings.friction, 0.01, 0.001], SOLIDS | FALLING if role == "held" else SOLIDS
+        for shape in geom_shapes(geometry, pose, body.name):
+            geom = body.add_geom(type=getattr(self._mj.mjtGeom, f"mjGEOM_{shape.kind}"))
+            geom.pos, geom.quat, geom.rgba = shape.pose[:3, 3], _quaternion(shape.pose), COLORS[role]
+            geom.contype, geom.conaffinity = SOLIDS, bits
+            geom.friction, geom.condim = friction, 4
+            geom.solref, geom.solimp = SOFT_CONTACT["solref"], SOFT_CONTACT["solimp"]
+            geom.size[: len(shape.size)] = shape.size
+            if shape.vertices is not None:
+                geom.meshname = f"mesh {next(self._numbers)}"
+                spec.add_mesh(name=geom.meshname, uservert=shape.vertices.ravel())
+
+    def _add_exclusions(self, spec: Any) -> None:
+        """Exclude the pairs that the checker does not check: of the robot, of held objects, and of the problem."""
+        robot, model = self.robot, self.robot.model
+        items = list(robot.geometry.geometryObjects)
+        links = [link_of(model, item) for item in items]
+        checked = {frozenset((links[pair.first], links[pair.second])) for pair in robot.geometry.collisionPairs}
+        pairs = {frozenset(pair) for pair in combinations(sorted(set(links)), 2)} - checked
+        for held in self.held:
+            own = [link for link in held.touch_links or () if link in links]
+            for holder in held.holders if held.touch_links is None else ():
+                own += robot.hand_of(holder)
+            pairs |= {frozenset((held.name, link)) for link in own}
+        for one, other in combinations(self.held, 2):
+            if _joint_of(robot, one.link) == _joint_of(robot, other.link):
+                pairs.add(frozenset((one.name, other.name)))
+        pairs |= {frozenset(pair) for pair in (self.problem.allowed if self.problem else ()) if len(set(pair)) == 2}
+        for first, second in sorted(sorted(pair) for pair in pairs):
+            spec.add_exclude(bodyname1=first, bodyname2=second)
+
+    def _add_surroundings(self, spec: Any) -> None:
+        """Add the floor, light and background."""
+        floor = spec.worldbody.add_geom(name="floor", type=self._mj.mjtGeom.mjGEOM_PLANE)
+        floor.size, floor.pos, floor.rgba = [3.0, 3.0, 0.1], [0.0, 0.0, self.settings.floor], COLORS["floor"]
+        floor.contype, floor.conaffinity, floor.condim = FALLING, 0, 4
+        mj = self._mj
+        light = spec.worldbody.add_light(pos=[1.0, -1.0, 3.0], dir=[-0.3, 0.3, -1.0])
+        light.type, light.diffuse = mj.mjtLightType.mjLIGHT_DIRECTIONAL, [0.5, 0.5, 0.5]
+        spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.4, 0.4, 0.4], [0.35, 0.35, 0.35]
+        spec.visual.headlight.specular = [0.0, 0.0, 0.0]
+        sky = spec.add_texture(name="sky", type=mj.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=64)
+        sky.builtin, sky.rgb1, sky.rgb2 = mj.mjtBuiltin.mjBUILTIN_GRADIENT, COLORS["floor"][:3], COLORS["floor"][:3]
+        spec.visual.quality.numslices, spec.visual.quality.numstacks = 64, 32
+
+
+def with_mass(held: AttachedObject, density: float) -> AttachedObject:
+    """Return a held object with a mass; without one it has that of its shape at a density [kg/m^3]."""
+    if held.mass is not None:
+        return held
+    volume = abs(float(coal_geometry(held).computeVolume()))
+    return held.model_copy(update={"mass": max(LEAST_MASS, density * volume)})
+
+
+def payloads(robot: Robot, problem: Problem) -> tuple[Load, ...]:
+    """Return the payload of a problem: balls at the grasp points of hands, or at the origins of links.
+
+    Raises:
+        UnknownNameError: There is no such hand or link.
+    """
+    points = {name: (hand.palm, np.asarray(hand.point)) for name, hand in robot.hands.items()}
+    for name in problem.payload:
+        robot.link_frame(points.get(name, (name,))[0])
+    found = ((*points.get(name, (name, np.zeros(3))), mass) for name, mass in problem.payload.items())
+    inertia = 0.4 * PAYLOAD_RADIUS**2 * np.eye(3)
+    return tuple(Load(link, mass, point, mass * inertia) for link, point, mass in found)
+
+
+def held_loads(robot: Robot, problem: Problem, settings: TwinSettings) -> tuple[Load, ...]:
+    """Return the masses that the robot holds in a problem: held objects and the payload."""
+    loads = (held_load(with_mass(held, settings.density)) for held in problem.attached)
+    return (*(load for load in loads if load is not None), *payloads(robot, problem))
+
+
+def servo_gains(robot: Robot, settings: TwinSettings) -> dict[str, tuple[float, float]]:
+    """Return the stiffness and the damping of the servo of each planned joint (:class:`TwinSettings`)."""
+    data = robot.model.createData()
+    inertia = np.empty(robot.dof)
+    inertia[robot.state_order] = np.diag(pin.crba(robot.model, data, robot.to_pinocchio(robot.home)))
+    leaders = {one.leader for one in mimic_joints(robot.urdf)}
+    found = {}
+    for k, name in enumerate(robot.joint_names):
+        stem, number = name[:-1], name[-1:]
+        rotor = LEADER_ARMATURE if name in leaders else settings.armature
+        mass = float(inertia[k]) + rotor
+        stiffness = mass * BANDWIDTH**2
+        if stem.endswith("joint") and number in "1234567" and robot.effort[k] == PANDA_EFFORT[int(number) - 1]:
+            stiffness = PANDA_STIFFNESS[int(number) - 1]
+        found[name] = stiffness, 2.0 * math.sqrt(stiffness * mass)
+    return found | {name: (float(kp), float(kd)) for name, (kp, kd) in settings.gains.items()}
+
+
+def _joint_of(robot: Robot, link: str) -> int:
+    return int(robot.model.frames[robot.link_frame(link)].parentJoint)
+
+
+def _quaternion(pose: Array) -> list[float]:
+    """Return the rotation of a pose as a quaternion wxyz, as MuJoCo has it."""
+    turn = pin.Quaternion(pose[:3, :3]).normalized()
+    return [turn.w, turn.x, turn.y, turn.z]
