@@ -1,8 +1,8 @@
 """A driver over ROS 2: motions go to joint trajectory controllers, and the state comes from their joint states.
 
 Each controller gets its joints of a motion as ``trajectory_msgs/JointTrajectory`` with positions, velocities and
-accelerations, whose header says when it starts. A ``joint_trajectory_controller`` follows its quintic polynomials
-between the points, which are the motion itself, and from then on in place of the trajectory before (parameter
+accelerations, whose header says when it starts. A ``joint_trajectory_controller`` follows quintic polynomials
+between the points, which are the motion itself, and replaces the trajectory before at that time (parameter
 ``allow_trajectory_replacement`` where there is one). As the motion starts in the state that is commanded then, there is
 nothing for the controller to bridge.
 """
@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
@@ -119,7 +120,11 @@ class Ros2Driver:
     @property
     def time(self) -> float:
         """Time on the node's clock since the start of the driver [s]."""
-        return float((self._node.get_clock().now().nanoseconds - self._zero) / NANOSECONDS)
+        return float(self.times_of(self._node.get_clock().now().nanoseconds))
+
+    def times_of(self, stamps: ArrayLike) -> Array:
+        """Return stamps of the node's clock, shape (N,) [ns], as times of the driver [s]."""
+        return np.asarray((np.asarray(stamps, np.int64) - self._zero) / NANOSECONDS)
 
     @property
     def end(self) -> float:

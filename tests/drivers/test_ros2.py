@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -10,10 +9,11 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from support import ROOT
+from support import ROOT, benchmark_script
 
 from apex_ompl.drivers import Ros2Driver
 from apex_ompl.errors import DriverError, ParameterError
@@ -24,38 +24,7 @@ from apex_ompl.types import Array
 pytest.importorskip("rclpy")
 
 ALIKE = 1e-6  # of a sample to the motion [rad]
-STAND_IN = ROOT / "tests" / "helpers" / "stand_in_controller.py"
-PREFIX = "r_"  # of joints in ROS
-
-
-class StandIns:
-    """Controllers of the left arm with hand, and of the right one."""
-
-    def __init__(self, robot: Robot, folder: Path) -> None:
-        left = [name for name in robot.joint_names if name.startswith("left")]
-        self.joints = {"left": left, "right": [name for name in robot.joint_names if name not in left]}
-        self.robot, self.folder = robot, folder
-        self.processes = []
-        for name, joints in self.joints.items():
-            at = [f"{PREFIX}{joint}={float(robot.home[robot.joint_names.index(joint)])!r}" for joint in joints]
-            command = [sys.executable, str(STAND_IN), str(folder / name), name, *map(str, at)]
-            self.processes.append(subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}))
-
-    def driver(self, **options: float) -> Ros2Driver:
-        renamed = {name: PREFIX + name for name in self.robot.joint_names}
-        return Ros2Driver(self.robot, self.joints, renamed=renamed, **{"started": 60.0, "silence": 10.0} | options)
-
-    def followed(self) -> tuple[Array, Array]:
-        """Times by the controllers' clock [ns], and states; of each only samples that were written whole."""
-        times, found = [], []
-        for name, joints in self.joints.items():
-            lines = (self.folder / name).read_text().splitlines()[:-1]
-            rows = np.array([json.loads(one) for one in lines])
-            states = np.full((len(rows), self.robot.dof), np.nan)
-            states[:, [self.robot.joint_names.index(joint) for joint in joints]] = rows[:, 1:]
-            times.append(np.array([json.loads(one)[0] for one in lines], np.int64))
-            found.append(states)
-        return np.concatenate(times), np.concatenate(found)
+stand_ins_of = benchmark_script("physics.stand_ins")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -69,12 +38,10 @@ def _alone() -> Iterator[None]:
 
 
 @pytest.fixture
-def stand_ins(robot: Robot, tmp_path: Path) -> Iterator[StandIns]:
-    found = StandIns(robot, tmp_path)
+def stand_ins(robot: Robot, tmp_path: Path) -> Iterator[Any]:
+    found = stand_ins_of.StandIns(robot, tmp_path)
     yield found
-    for process in found.processes:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    found.close()
 
 
 def motion_from(robot: Robot, q: Array, *ways: float) -> Trajectory:
@@ -90,22 +57,7 @@ def wait(driver: Ros2Driver, until: float) -> None:
         time.sleep(0.01)
 
 
-def compare(stand_ins: StandIns, driver: Ros2Driver, commanded: list[tuple[float, Trajectory]]) -> int:
-    """Compare each sample of the controllers with the motion that was commanded then; return how many moved."""
-    times, states = stand_ins.followed()
-    moving = 0
-    for stamp, state in zip(times.tolist(), states, strict=True):
-        now = (stamp - driver._zero) / 1e9
-        sent = [(at, motion) for at, motion in commanded if at <= now]
-        at, motion = sent[-1] if sent else (0.0, commanded[0][1].before(0.0))
-        wanted = motion(min(now - at, motion.duration)) if sent else commanded[0][1].positions[0]
-        known = np.isfinite(state)
-        assert np.abs(state - wanted)[known].max() <= ALIKE, now
-        moving += bool(sent) and 0.0 < now - at < motion.duration
-    return moving
-
-
-def test_controllers_follow_motions_and_handovers_in_the_middle(robot: Robot, stand_ins: StandIns) -> None:
+def test_controllers_follow_motions_and_handovers_in_the_middle(robot: Robot, stand_ins: Any) -> None:
     driver, commanded = stand_ins.driver(), list[tuple[float, Trajectory]]()
     q = robot.home
     for k, by in enumerate((0.3, -0.3, 0.2)):
@@ -122,11 +74,12 @@ def test_controllers_follow_motions_and_handovers_in_the_middle(robot: Robot, st
         q = rest.positions[-1]
         state = driver.state()
         assert np.abs(state.positions - q).max() <= ALIKE and not state.velocities.any(), k
-    assert compare(stand_ins, driver, commanded) > 30
+    off, moving = stand_ins_of.differences(stand_ins, driver, commanded)
+    assert off.max() <= ALIKE and moving > 30
     driver.close()
 
 
-def test_a_stop_over_the_network_ends_at_rest(robot: Robot, stand_ins: StandIns) -> None:
+def test_a_stop_over_the_network_ends_at_rest(robot: Robot, stand_ins: Any) -> None:
     driver = stand_ins.driver()
     motion = motion_from(robot, robot.home, 0.8)
     start = driver.time + 0.1
@@ -152,10 +105,10 @@ import os, sys, time, numpy as np
 sys.path.insert(0, {helpers!r}); sys.path.insert(0, {tests!r})
 from apex_ompl.drivers import Ros2Driver
 from apex_ompl.robot import load_robot
-from test_ros2 import PREFIX, motion_from
+from test_ros2 import motion_from
 robot = load_robot("dual_panda_softhand")
 joints = {joints!r}
-driver = Ros2Driver(robot, joints, renamed={{name: PREFIX + name for name in robot.joint_names}}, started=60.0)
+driver = Ros2Driver(robot, joints, renamed={{name: {prefix!r} + name for name in robot.joint_names}}, started=60.0)
 motion = motion_from(robot, robot.home, 0.4)
 driver.send(motion, driver.time + 0.1)
 time.sleep(0.1 + 0.5 * motion.duration)
@@ -163,10 +116,11 @@ os.kill(os.getpid(), 9)
 """
 
 
-def test_a_client_that_is_killed_leaves_the_robot_at_rest(robot: Robot, stand_ins: StandIns) -> None:
+def test_a_client_that_is_killed_leaves_the_robot_at_rest(robot: Robot, stand_ins: Any) -> None:
     code = KILLED.format(
-        helpers=str(ROOT / "tests" / "helpers"), tests=str(ROOT / "tests" / "drivers"), joints=stand_ins.joints
-    )
+        helpers=str(ROOT / "tests" / "helpers"), tests=str(ROOT / "tests" / "drivers"), joints=stand_ins.joints,
+        prefix=stand_ins_of.PREFIX,
+    )  # fmt: skip
     killed = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert killed.returncode == -signal.SIGKILL
     time.sleep(1.0)
@@ -189,7 +143,7 @@ def test_robots_that_do_not_answer_are_named(robot: Robot) -> None:
         Ros2Driver(robot, "arms", lead=-1.0)
 
 
-def test_a_robot_that_falls_silent_is_noticed(robot: Robot, stand_ins: StandIns) -> None:
+def test_a_robot_that_falls_silent_is_noticed(robot: Robot, stand_ins: Any) -> None:
     driver = stand_ins.driver(silence=1.0)
     assert driver.state().stamp <= driver.time
     for process in stand_ins.processes:

@@ -1,8 +1,8 @@
 """A joint trajectory controller in a process of its own, by the documented rules of ROS 2's.
 
-A trajectory starts at the stamp of its header, at once where that is 0, and replaces the one before from then on.
+A trajectory starts at the stamp of its header, at once where that is 0, and replaces the one before at that time.
 Between points the polynomial of fifth degree is followed; after the last one the robot stays. Before the first point it
-is that from the state at the start. Joint states are published 200 times a second. Each sample is written to a file.
+is that from the state at the start. Joint states are published 200 times a second, and each is written to a file.
 
 Usage: python stand_in_controller.py FILE NAME JOINT=POSITION ...
 """
@@ -38,11 +38,13 @@ class Controller:
     """What the controller follows, and from when on."""
 
     def __init__(self, names: list[str], position: np.ndarray) -> None:
+        """Rest at a position, shape (joints,)."""
         self.names = names
         rest = np.stack([position, 0.0 * position, 0.0 * position])
         self.plan: list[tuple[int, list[tuple[float, np.ndarray]]]] = [(0, [(0.0, rest)])]
 
     def take(self, message: Any, now: int) -> None:
+        """Take a message at a time [ns]."""
         stamp = message.header.stamp.sec * NS + message.header.stamp.nanosec
         start = stamp or now
         assert list(message.joint_names) == self.names
@@ -55,6 +57,7 @@ class Controller:
         self.plan = [one for one in self.plan if one[0] < start] + [(start, points)]
 
     def state(self, now: int) -> np.ndarray:
+        """Return position, velocity and acceleration at a time [ns], shape (3, joints)."""
         start, points = [one for one in self.plan if one[0] <= now][-1]
         since = (now - start) / NS
         if since >= points[-1][0]:
@@ -72,6 +75,7 @@ class Controller:
 
 
 def main() -> None:
+    """Follow trajectories until the process is killed."""
     path, name, *given = sys.argv[1:]
     pairs = [one.split("=") for one in given]
     controller = Controller([joint for joint, _ in pairs], np.array([float(value) for _, value in pairs]))
