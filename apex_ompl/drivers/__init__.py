@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from apex_ompl.drivers.bag import BagDriver as BagDriver
     from apex_ompl.drivers.driver import Driver as Driver
     from apex_ompl.drivers.driver import DriverState as DriverState
     from apex_ompl.drivers.kinematic import KinematicDriver as KinematicDriver
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "bag": "BagDriver",
         "driver": "Driver DriverState",
         "kinematic": "KinematicDriver",
         "mujoco": "MujocoDriver",

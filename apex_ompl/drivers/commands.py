@@ -80,6 +80,11 @@ class Commands:
             motion = motion.stop_at(now - self._starts[k], self.limits)
         self._starts[k:], self._motions[k:] = [self._starts[k]], [motion]
 
+    def rest(self, at: float) -> Trajectory:
+        """Return the motion that is under way at a time, from that time on [s]."""
+        k = max(bisect_right(self._starts, at) - 1, 0)
+        return self._motions[k].after(max(at - self._starts[k], 0.0))
+
     def stopping(self, at: float) -> Trajectory:
         """Return the stop along the motion that is under way at a time, from that time on [s]."""
         k = max(bisect_right(self._starts, at) - 1, 0)

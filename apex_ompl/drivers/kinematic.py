@@ -87,6 +87,18 @@ class KinematicDriver:
             position, velocity, _ = self._commands.states(np.array([now]))[:, 0]
             return DriverState(now, position, velocity)
 
+    def states(self, times: Array) -> tuple[Array, Array]:
+        """Return the commanded positions and velocities at increasing times from now on, shape (N, dof) each."""
+        with self._open():
+            position, velocity, _ = self._commands.states(times)
+            return position, velocity
+
+    def under_way(self) -> tuple[Trajectory, float]:
+        """Return the rest of the motion that is under way, and the time, from which on it is followed [s]."""
+        with self._open():
+            now = self.time
+            return self._commands.rest(now), now
+
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         with self._open():

@@ -1,4 +1,4 @@
-"""The optional libraries: MuJoCo, and the client library of ROS 2."""
+"""The optional libraries: MuJoCo, the client library of ROS 2, and rosbags."""
 
 from __future__ import annotations
 
@@ -44,3 +44,19 @@ def rclpy() -> Any:
     except ImportError as error:
         raise MissingFileError("rclpy", "package for ROS 2", "install the extra: apex-ompl[ros2]") from error
     return SimpleNamespace(**found)
+
+
+def rosbags() -> Any:
+    """Return what drivers use of ``rosbags``, as one namespace.
+
+    Raises:
+        MissingFileError: The extra ``bags`` is not installed.
+    """
+    try:
+        with unforked():
+            bags, types = import_module("rosbags.rosbag2"), import_module("rosbags.typesys")
+    except ImportError as error:
+        raise MissingFileError("rosbags", "package for bags of ROS 2", "install the extra: apex-ompl[bags]") from error
+    return SimpleNamespace(
+        Writer=bags.Writer, plugin=bags.StoragePlugin, types=types.get_typestore(types.Stores.ROS2_JAZZY)
+    )

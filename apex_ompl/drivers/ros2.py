@@ -19,17 +19,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
+from apex_ompl.drivers.controllers import NANOSECONDS, Controllers
 from apex_ompl.drivers.driver import DriverState
 from apex_ompl.drivers.library import rclpy
 from apex_ompl.errors import DriverError, ParameterError
 from apex_ompl.robot.model import Robot
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
-from apex_ompl.util.arrays import distinct
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_positive
 
-NANOSECONDS = 10**9
 LEAD = 0.03  # after which a stop starts [s]
 SILENCE = 0.5  # age of the state after which the robot counts as silent [s]
 STARTED = 10.0  # time to wait for controllers and the first state [s]
@@ -45,7 +44,7 @@ class Ros2Driver:
     Attributes:
         names: Names of the joints.
         limits: Limits of the joints.
-        controllers: Names of the joints that each controller moves, by its name.
+        controllers: The controllers.
     """
 
     def __init__(
@@ -76,14 +75,7 @@ class Ros2Driver:
         for name, value in {"lead": lead, "silence": silence, "started": started}.items():
             check_positive(value, name)
         self.names, self.limits = robot.joint_names, robot.limits
-        one = {controllers: self.names} if isinstance(controllers, str) else dict(controllers)
-        self.controllers = {name: tuple(joints) for name, joints in one.items()}
-        _check_joints(self.controllers, self.names)
-        renamed = dict(renamed or {})
-        unknown = sorted({*renamed} - {*self.names})
-        if unknown:
-            raise ParameterError("renamed", unknown[0], f"joints of {robot.name}")
-        self._ros_names = {name: renamed.get(name, name) for name in self.names}
+        self.controllers = Controllers(self.names, controllers, renamed)
         self._lead, self._silence, self._closed = lead, silence, False
         self._lock, self._arrived = threading.Lock(), threading.Condition()
         self._measured: tuple[int, Array, Array] | None = None
@@ -95,8 +87,8 @@ class Ros2Driver:
             self._node = ros.create_node(node, context=self._context)
             self._zero = self._node.get_clock().now().nanoseconds
             self._publishers = {
-                name: self._node.create_publisher(ros.JointTrajectory, f"/{name}/joint_trajectory", DEPTH)
-                for name in self.controllers
+                topic: self._node.create_publisher(ros.JointTrajectory, topic, DEPTH)
+                for topic in self.controllers.topics
             }
             self._node.create_subscription(ros.JointState, states, self._take, ros.qos_profile_sensor_data)
             self._executor = ros.SingleThreadedExecutor(context=self._context)
@@ -115,7 +107,7 @@ class Ros2Driver:
 
     def __repr__(self) -> str:
         """Return the controllers, and whether the driver is closed."""
-        return one_line("Ros2Driver", ", ".join(self.controllers), "closed" if self._closed else "")
+        return one_line("Ros2Driver", ", ".join(self.controllers.joints), "closed" if self._closed else "")
 
     @property
     def time(self) -> float:
@@ -189,12 +181,12 @@ class Ros2Driver:
             self._arrived.wait_for(lambda: self._measured is not None, started)
             measured = self._measured
         if measured is None:
-            missing = [name for name, other in self._ros_names.items() if other not in self._seen]
+            missing = [name for name in self.controllers.ros_names if name not in self._seen]
             raise DriverError(f"no state of {', '.join(missing)} came on {states} in {started:g} s")
-        for name, publisher in self._publishers.items():
+        for topic, publisher in self._publishers.items():
             with self._arrived:
                 if not self._arrived.wait_for(partial(_is_heard, publisher), started):
-                    raise DriverError(f"no controller listens to /{name}/joint_trajectory")
+                    raise DriverError(f"no controller listens to {topic}")
         return measured[1]
 
     def _take(self, message: Any) -> None:
@@ -204,7 +196,7 @@ class Ros2Driver:
         for name, position, velocity in zip(message.name, message.position, speeds, strict=False):
             if np.isfinite(position) and np.isfinite(velocity):
                 self._seen[name] = (stamp, position, velocity)
-        rows = [self._seen.get(other) for other in self._ros_names.values()]
+        rows = [self._seen.get(name) for name in self.controllers.ros_names]
         with self._arrived:
             if all(row is not None for row in rows):
                 found = np.array([row[1:] for row in rows if row is not None])
@@ -215,29 +207,15 @@ class Ros2Driver:
         self._commands.send(motion, at, now)
         self._commands.forget(now)
         start = self._zero + round(at * NANOSECONDS)
-        ticks = distinct(np.round(motion.times * NANOSECONDS).astype(np.int64))
-        states = motion.states(np.minimum(ticks / NANOSECONDS, motion.duration))
-        for controller, joints in self.controllers.items():
-            columns = [self.names.index(name) for name in joints]
-            message = self._message(joint_names=[self._ros_names[name] for name in joints])
+        for part in self.controllers.parts(motion):
+            message = self._message(joint_names=part.joints)
             message.header.stamp = self._ros_time(nanoseconds=start).to_msg()
-            for tick, (q, v, a) in zip(ticks.tolist(), np.moveaxis(states[:, :, columns], 1, 0).tolist(), strict=True):
+            for tick, q, v, a in part.points:
                 point = self._point(positions=q, velocities=v, accelerations=a)
                 point.time_from_start.sec, point.time_from_start.nanosec = divmod(tick, NANOSECONDS)
                 message.points.append(point)
-            self._publishers[controller].publish(message)
+            self._publishers[part.topic].publish(message)
 
 
 def _is_heard(publisher: Any) -> bool:
     return bool(publisher.get_subscription_count() > 0)
-
-
-def _check_joints(controllers: Mapping[str, tuple[str, ...]], names: tuple[str, ...]) -> None:
-    """Check that each joint has one controller."""
-    given = [joint for joints in controllers.values() for joint in joints]
-    for joint in given:
-        if joint not in names:
-            raise ParameterError("controllers", joint, f"joints of the robot: {', '.join(names)}")
-    for name in names:
-        if given.count(name) != 1:
-            raise ParameterError("controllers", f"{given.count(name)} for {name}", "one controller for each joint")

@@ -16,22 +16,12 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from quintic import quintic  # of this folder: the program is run by its file
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
 NS = 10**9
-
-
-def quintic(span: float, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Coefficients of the polynomial through two states, rows of position, velocity, acceleration: (6, joints)."""
-    t = span ** np.arange(6)
-    rows = np.zeros((6, 6))
-    rows[0, 0], rows[1, 1], rows[2, 2] = 1.0, 1.0, 2.0
-    rows[3] = t
-    rows[4, 1:] = np.arange(1, 6) * t[:5]
-    rows[5, 2:] = np.arange(2, 6) * np.arange(1, 5) * t[:4]
-    return np.linalg.solve(rows, np.concatenate([before, after]))
 
 
 class Controller:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 from loops import FAR, PROBLEM, ByHand, line, setup_of
 
 from apex_ompl import Loop, LoopSettings, problems
-from apex_ompl.drivers import Driver, KinematicDriver, MujocoDriver
+from apex_ompl.drivers import BagDriver, Driver, KinematicDriver, MujocoDriver
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import Outcome
 from apex_ompl.robot import Robot
@@ -20,8 +22,8 @@ from apex_ompl.scene.scripts import standing
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
 
-NEAR = {"kinematic": 1e-9, "mujoco": 1e-3}  # of a state to the commanded one [rad]
-AT_REST = {"kinematic": 1e-9, "mujoco": 0.02}  # of a joint's speed [rad/s]
+NEAR = {"kinematic": 1e-9, "bag": 1e-9, "mujoco": 1e-3}  # of a state to the commanded one [rad]
+AT_REST = {"kinematic": 1e-9, "bag": 1e-9, "mujoco": 0.02}  # of a joint's speed [rad/s]
 STEP = 0.01
 
 
@@ -30,7 +32,14 @@ def mujoco_driver(robot: Robot, state: Array) -> MujocoDriver:
     return MujocoDriver(robot, state=state)
 
 
-MAKERS: dict[str, Callable[[Robot, Array], Any]] = {"kinematic": KinematicDriver, "mujoco": mujoco_driver}
+def bag_driver(robot: Robot, state: Array) -> BagDriver:
+    pytest.importorskip("rosbags")
+    return BagDriver(robot, Path(mkdtemp()) / "bag", state=state)
+
+
+MAKERS: dict[str, Callable[[Robot, Array], Any]] = {
+    "kinematic": KinematicDriver, "bag": bag_driver, "mujoco": mujoco_driver,
+}  # fmt: skip
 
 
 class Tried:
