@@ -270,4 +270,8 @@ def _use_run() -> None:
     with apex_ompl.Loop(problem, settings=settings) as loop:
         loop.observe(0.0, [])
         command = loop.step(0.0, problem.start_state(loop.joint_names))
-        assert command is not None and command.rests and loop.outcome is None
+        assert command is not None and command.rests and loop.outcome is None and loop.record is None
+        assert loop.missed() is not None
+        loop.abort("enough")
+        assert loop.step(0.01) is not None and loop.outcome is not None and loop.reason == "enough"
+        assert loop.events[-1].time <= 0.03
