@@ -51,11 +51,12 @@ TOLERANCE_SCALE = 0.1  # of angles among them [rad]
 
 
 def told(robot: Robot, constraints: ConstraintSet) -> Array:
-    """Return what a model is told of constraints, shape (TOLD,); zeros stand for what does not apply.
+    """Return what a model is told of constraints, shape (TOLD,).
 
-    The first features are of a closed chain of both hands: 1, the position of the right hand's frame in the left
-    hand's [m], and the first two columns of its orientation. Then follow, for each hand, those of an axis that is kept
-    upright: 1, the axis in the frame of the hand's joint, and the tolerance in units of ``TOLERANCE_SCALE``.
+    The first features are of a closed chain of both hands: 1, the position of the right palm in the left palm's frame
+    [m], and the first two columns of the orientation of the right palm's joint in the frame of the left one's. Then
+    follow, for each hand, those of an axis that is kept upright: 1, the axis in the frame of the palm's joint, and the
+    tolerance in units of ``TOLERANCE_SCALE``. Zeros stand for what does not apply.
 
     Args:
         robot: A robot with two hands.

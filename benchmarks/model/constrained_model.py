@@ -30,6 +30,7 @@ from apex_ompl import load_model
 from apex_ompl.evaluation import Row, Workers, bench
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run
 from apex_ompl.model.checkpoint import SHIPPED, read_config
+from apex_ompl.problems.broad import UNSEEN
 from apex_ompl.problems.catalogue import CONSTRAINED, SPLITS, VALIDATION
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.statistics import share_interval
@@ -58,6 +59,7 @@ LOG_EVERY = 200  # steps
 DRAWS = 2000  # of the bootstrap
 MODULE = "benchmarks.model.constrained_runs"
 LINE = "straight line"
+LEVELS = tuple(f"unseen, {level}" for level in CONSTRAINED[UNSEEN])  # groups that are too small for pairs of rows
 KINDS = ("proposals", "planner without trees", "planner")
 PAIRS = ((CONSTRAINED_MODEL, APEX), (CONSTRAINED_MODEL, PATHS), (PATHS, APEX))
 
@@ -254,7 +256,8 @@ def compare(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
                 if mine:
                     row = model if kind == KINDS[0] else f"{model}{', no trees' if kind == KINDS[1] else ''}"
                     lines[name].append(line(group, row, mine))
-        lines["paired"] += [paired(group, kind, *pair, there) for kind in KINDS for pair in PAIRS]
+        if group not in LEVELS:
+            lines["paired"] += [paired(group, kind, *pair, there) for kind in KINDS for pair in PAIRS]
     heads = {"proposals": PROPOSALS_HEAD, "planner": PLANNER_HEAD, "paired": PAIRED_HEAD}
     texts = {"paired": 4}
     text = [
