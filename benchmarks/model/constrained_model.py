@@ -132,13 +132,14 @@ def rows_of(models: Mapping[str, Path]) -> list[Row]:
 
 
 def problems_of(count: int, unseen: int) -> list[str]:
-    """Return the ids of the problems: so many of each level, and of each level of unseen kinds."""
-    seeds = SPLITS["validation"][FIRST:]
+    """Return the ids of the problems: so many of each level, and of each level of unseen kinds, the levels in turn."""
+    levels = [(suite, level) for suite, some in CONSTRAINED.items() for level in some]
     return [
-        f"{suite}/{level}/{seed}"
-        for suite, levels in CONSTRAINED.items() for level in levels
-        for seed in seeds[: unseen if suite in VALIDATION else count]
-    ]  # fmt: skip
+        f"{suite}/{level}/{SPLITS['validation'][FIRST + number]}"
+        for number in range(max(count, unseen))
+        for suite, level in levels
+        if number < (unseen if suite in VALIDATION else count)
+    ]
 
 
 def groups_of(runs: Sequence[Run]) -> dict[str, set[str]]:

@@ -7,7 +7,7 @@ of the planner.
 from __future__ import annotations
 
 import time
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from unittest import mock
 
@@ -42,9 +42,15 @@ def _loaded(folder: str) -> ArrayModel:
     return constrained_told.load(Path(folder), ROBOT)
 
 
+@lru_cache(maxsize=1)
+def _assembled(problem: str, seed: int) -> PlanningSetup:
+    """Return a problem made ready, the last one from a cache: all rows run on a problem before the next one."""
+    return assemble(load_problem(problem), robot(), seed)
+
+
 def _prepared(job: Job) -> tuple[PlanningSetup, ArrayModel]:
     """Return the problem of a run and its model, which is told the constraints if it can be."""
-    setup = assemble(load_problem(job.problem), robot(), job.seed)
+    setup = _assembled(job.problem, job.seed)
     assert setup.constraints is not None
     model = _loaded(job.params["model"])
     constrained_told.tell(model, told(robot(), setup.constraints))
@@ -53,7 +59,7 @@ def _prepared(job: Job) -> tuple[PlanningSetup, ArrayModel]:
 
 def line(job: Job) -> Run:
     """Return whether the straight line, optimized under constraints, is a path."""
-    setup = assemble(load_problem(job.problem), robot(), job.seed)
+    setup = _assembled(job.problem, job.seed)
     paths, begun = paths_on(setup, Spline()), time.process_time()
     found = paths.repaired(paths.optimizer.spline.line(setup.start, setup.goals[0]))
     return {"solved": found is not None, "cpu": time.process_time() - begun, "fault": ""}
@@ -105,6 +111,7 @@ def planned(job: Job) -> Run:
     parameters = ApexParameters(seed=job.seed, **({} if job.params["trees"] else WITHOUT_TREES))
     with mock.patch.object(apex_planner, "trajectory_model", lambda *_: model), quiet_ompl():
         planner = parameters.build(setup.simple_setup.getSpaceInformation())
+        setup.simple_setup.getProblemDefinition().clearSolutionPaths()  # of other rows
         setup.simple_setup.setPlanner(planner)
         setup.simple_setup.setup()
     with mock.patch.object(time, "perf_counter", time.process_time), quiet_ompl():  # times of the report are CPU times
