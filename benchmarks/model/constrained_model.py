@@ -7,7 +7,8 @@ learning rates and seeds, on one core: ``constrained`` is told the constraints (
 ``compare``: both and ``apex`` itself on validation problems of the suites and of unseen kinds. Those that are frozen
 are left out: planners are compared on them elsewhere. Shown are how far 16 proposals are off the constraints, and which
 of them become paths when they are optimized under constraints; then the planner, with trees and without. ``line fails``
-are the problems whose straight line does not become a path.
+are the problems whose straight line does not become a path. Raw proposals at lower temperatures follow, of some of the
+problems, and those of ``constrained`` without what it is told.
 
 Everything is kept in benchmarks/runs/constrained_model and resumed from there; a comparison has a folder of its own for
 each set of checkpoints. On one core, data take 20 minutes, training 10, the comparison 15.
@@ -39,6 +40,8 @@ from benchmarks.lib import record
 from benchmarks.lib.controls import digest
 from benchmarks.model import constrained_data, constrained_told
 from benchmarks.model.constrained_data import PATHS
+from benchmarks.model.constrained_runs import LINE as LINE_KEY
+from benchmarks.model.constrained_runs import TEMPERATURES
 from benchmarks.timing.motions import cells, table
 
 DEPENDS = (
@@ -58,7 +61,8 @@ RATE, WARMUP, EMA = 3e-4, 100, 0.998
 LOG_EVERY = 200  # steps
 DRAWS = 2000  # of the bootstrap
 MODULE = "benchmarks.model.constrained_runs"
-LINE = "straight line"
+LINE, UNTOLD = "straight line", f"{CONSTRAINED_MODEL}, told zeros"
+RAW = (2, 8)  # problems of a level whose raw proposals are looked at, and of a level of unseen kinds
 LEVELS = tuple(f"unseen, {level}" for level in CONSTRAINED[UNSEEN])  # groups that are too small for pairs of rows
 KINDS = ("proposals", "planner without trees", "planner")
 PAIRS = ((CONSTRAINED_MODEL, APEX), (CONSTRAINED_MODEL, PATHS), (PATHS, APEX))
@@ -210,6 +214,34 @@ PAIRED_HEAD = (
 )  # fmt: skip
 
 
+RAW_HEAD = (
+    "problems", "row", "temperature", "N", "distance mm p50", "p95", "angle mrad p50", "p95", "tilt mrad p50", "p95",
+)  # fmt: skip
+
+
+def raw_rows(models: Mapping[str, Path]) -> list[Row]:
+    """Return the rows of raw proposals: of each model, and of the one that is told, without what it is told."""
+    some = [(name, name, True) for name in models] + [(UNTOLD, CONSTRAINED_MODEL, False)]
+    return [
+        Row(label, APEX, {"model": str(models[name]), "told": is_told}, runner=f"{MODULE}:raw")
+        for label, name, is_told in some
+    ]
+
+
+def raw_lines(runs: Sequence[Run]) -> list[list[Any]]:
+    """Return the lines of raw proposals, and of the straight line."""
+    found = []
+    for group in ("suites", UNSEEN):
+        there = [run for run in runs if run["problem"].startswith(f"{UNSEEN}/") == (group == UNSEEN)]
+        labels = dict.fromkeys(run["label"] for run in there)
+        for label, name in [(APEX, LINE_KEY), *((some, f"{t:g}") for some in labels for t in TEMPERATURES)]:
+            mine = [run[name] for run in there if run["label"] == label]
+            off = [[value for run in mine for value in run[k]] for k in range(3)]
+            row = (LINE, "-") if name == LINE_KEY else (label, name)
+            found.append([group, *row, len(mine), *(c for some in off for c in cells(some, (50, 95), 1e3, 0))])
+    return found
+
+
 def paired(group: str, kind: str, one: str, other: str, runs: Sequence[Run]) -> list[Any]:
     """Return how a model compares with another one on the same problems."""
     mine, theirs = (
@@ -238,10 +270,13 @@ def compare(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     """Run what is missing of the comparison, and return its tables."""
     models = checkpoints(args)
     made_of = digest(*(folder / file for folder in models.values() for file in ("config.json", "model.safetensors")))
-    ids = problems_of(args.n, args.unseen)
-    made = bench(
-        ids, rows_of(models), args.store / f"compare-{made_of}", runs=1, timeout=TIMEOUT, split="validation",
-        workers=Workers(args.jobs), provenance=record.session(),
+    ids, few = problems_of(args.n, args.unseen), problems_of(*map(min, RAW, (args.n, args.unseen)))
+    made, proposed = (
+        bench(
+            some, rows, args.store / f"{name}-{made_of}", runs=1, timeout=TIMEOUT, split="validation",
+            workers=Workers(args.jobs), provenance=record.session(),
+        )
+        for name, some, rows in (("compare", ids, rows_of(models)), ("raw", few, raw_rows(models)))
     )  # fmt: skip
     args.made_with = record.made_with(made)
     chosen = set(ids)
@@ -259,8 +294,9 @@ def compare(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
                     lines[name].append(line(group, row, mine))
         if group not in LEVELS:
             lines["paired"] += [paired(group, kind, *pair, there) for kind in KINDS for pair in PAIRS]
-    heads = {"proposals": PROPOSALS_HEAD, "planner": PLANNER_HEAD, "paired": PAIRED_HEAD}
-    texts = {"paired": 4}
+    lines["raw proposals"] = raw_lines([r for r in proposed.runs if r["problem"] in few and r["status"] != NO_PROBLEM])
+    heads = {"proposals": PROPOSALS_HEAD, "planner": PLANNER_HEAD, "paired": PAIRED_HEAD, "raw proposals": RAW_HEAD}
+    texts = {"paired": 4, "raw proposals": 3}
     text = [
         f"### {name.capitalize()}\n\n{table(heads[name], some, texts.get(name, 2))}" for name, some in lines.items()
     ]

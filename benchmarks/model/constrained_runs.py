@@ -7,6 +7,7 @@ of the planner.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from functools import cache, lru_cache
 from pathlib import Path
 from unittest import mock
@@ -29,11 +30,13 @@ from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import ROBOT, robot
 from apex_ompl.types import Array
 from benchmarks.model import constrained_told
-from benchmarks.model.constrained_data import paths_on, told, violations
+from benchmarks.model.constrained_data import TOLD, paths_on, told, violations
 from benchmarks.planners.head_to_head import TREELESS
 
 PROPOSALS = 16
+TEMPERATURES = (0.5, 1.0, 1.3)  # of raw proposals; the last one is that of the shipped model
 LIMIT = 0.5  # CPU time of the planner [s]
+LINE = "line"
 WITHOUT_TREES = {**TREELESS, "polish": False}
 
 
@@ -94,6 +97,30 @@ def proposed(job: Job) -> Run:
         "proposals_cpu": at_proposals, "length": min(lengths, default=None), "distance": _listed(off.distance),
         "angle": _listed(off.angle), "tilt": _listed(off.tilt), "fault": "",
     }  # fmt: skip
+
+
+def raw(job: Job) -> Run:
+    """Return how far proposals are off the constraints, by temperature, and the straight line.
+
+    Parameters are ``model``, the folder of a checkpoint, and ``told``: whether it is told the constraints, or zeros.
+    """
+    setup, model = _prepared(job)
+    constraints, kernel, spline = setup.constraints, setup.checker.kernel, model.spline
+    assert constraints is not None
+    if not job.params["told"]:
+        constrained_told.tell(model, np.zeros(TOLD))
+    query = make_query(setup.checker, setup.start, setup.goals[0], point=model.sees_point)
+    found: Run = {"solved": True, "fault": ""}
+    for temperature in (None, *TEMPERATURES):
+        if temperature is None:
+            control = spline.line(setup.start, setup.goals[0])[None]
+        else:
+            sampling, rng = replace(model.sampling, temperature=temperature), np.random.default_rng(job.seed)
+            control = model.propose(query, kernel, PROPOSALS, sampling=sampling, generator=rng).control
+        off = violations(constraints, np.stack([spline.path(points) for points in control]))
+        name = LINE if temperature is None else f"{temperature:g}"
+        found[name] = [_listed(off.distance), _listed(off.angle), _listed(off.tilt)]
+    return found
 
 
 def _listed(values: Array) -> list[float]:

@@ -171,6 +171,11 @@ def test_proposals_and_planner_make_runs(made: ModuleType) -> None:
     assert run["solved"] == (run["valid"] > 0.0) == (run["first_cpu"] is not None)
     assert len(run["distance"]) == len(run["angle"]) == runs.PROPOSALS and run["tilt"] == []
     assert run["cpu"] >= run["proposals_cpu"] > 0.0
+    raw = runs.raw(Job("unseen", TRAY, "", "apex", {**params, "told": False}, 0, 1.0, True))
+    assert [len(values) for values in raw[runs.LINE]] == [1, 1, 0]
+    for temperature in runs.TEMPERATURES:
+        assert [len(values) for values in raw[f"{temperature:g}"]] == [runs.PROPOSALS, runs.PROPOSALS, 0]
+    assert raw["0.5"] != raw["1"]
     run = runs.planned(Job("unseen", TRAY, "", "apex", {**params, "trees": True}, 0, 1.0, True))
     assert run["solved"] and run["first_cpu"] <= run["cpu"] and not run["fault"]
     setup = setup_of(TRAY)
@@ -192,6 +197,18 @@ def test_rows_are_compared_by_problem(script: ModuleType) -> None:
     found = dict(zip(script.PAIRED_HEAD, script.paired("all", kind, "one", "other", runs), strict=False))
     assert (found["N"], found["alone solved"], found["the other alone"]) == (2, 1, 0)
     assert found["share of proposals, difference"] == "0.625" and found["first CPU ratio"] == "2.000"
+
+
+def test_raw_proposals_are_pooled_by_temperature(script: ModuleType) -> None:
+    runs = [
+        {"label": "apex", "problem": f"{suite}/tray/1", "line": [[0.2], [0.1], []],
+         **{f"{t:g}": [[t * k, t], [0.1, 0.1], []] for t in script.TEMPERATURES}}
+        for k, suite in enumerate(("wall", "posts", "unseen"))
+    ]  # fmt: skip
+    lines = script.raw_lines(runs)
+    assert [line[:4] for line in lines[:2]] == [["suites", script.LINE, "-", 2], ["suites", "apex", "0.5", 2]]
+    assert lines[0][4] == "200" and lines[1][4] == "500" and lines[1][8] == "-"
+    assert len(lines) == 2 * (1 + len(script.TEMPERATURES)) and lines[-1][0] == "unseen" and lines[-1][3] == 1
 
 
 def test_the_interval_of_ratios_is_geometric(script: ModuleType) -> None:
