@@ -11,10 +11,10 @@ are the problems whose straight line does not become a path. Raw proposals at lo
 problems, and those of ``constrained`` without what it is told.
 
 Everything is kept in benchmarks/runs/constrained_model and resumed from there; a comparison has a folder of its own for
-each set of checkpoints. On one core, data take 20 minutes, training 10, the comparison 15.
+each set of checkpoints. On one core, data take 10 minutes, training 10, the comparison 25.
 
-Usage: python -m benchmarks.model.constrained_model [--part data train compare] [--problems 3600] [--steps 800]
-       [--batch 128] [-n 10] [--unseen 40]
+Usage: python -m benchmarks.model.constrained_model [--part data train compare] [--problems 1680] [--steps 600]
+       [--batch 128] [-n 8] [--unseen 48]
 """
 
 from __future__ import annotations
@@ -309,13 +309,13 @@ MEASURES = dict(zip(PARTS, (data, train, compare), strict=True))
 
 def main() -> None:
     """Run what is missing, and write the results."""
-    parser = record.parser(__doc__, n=10, jobs=1)
+    parser = record.parser(__doc__, n=8, jobs=1)
     parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS, help="(default: all)")
     parser.add_argument(
-        "--unseen", type=one_or_more, default=40, help="problems of a level of unseen (default: %(default)s)"
+        "--unseen", type=one_or_more, default=48, help="problems of a level of unseen (default: %(default)s)"
     )
-    parser.add_argument("--problems", type=one_or_more, default=3600, help="of the data (default: %(default)s)")
-    parser.add_argument("--steps", type=one_or_more, default=800, help="of a training (default: %(default)s)")
+    parser.add_argument("--problems", type=one_or_more, default=1680, help="of the data (default: %(default)s)")
+    parser.add_argument("--steps", type=one_or_more, default=600, help="of a training (default: %(default)s)")
     parser.add_argument("--batch", type=one_or_more, default=128, help="paths in a step (default: %(default)s)")
     parser.add_argument("--store", type=Path, default=FOLDER, help="folder of data, checkpoints and runs")
     parser.add_argument("--results", type=Path, default=record.RESULTS, help="folder of the results")
