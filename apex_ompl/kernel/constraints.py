@@ -43,7 +43,8 @@ __all__ = [
 ]
 
 MOST_ROWS = {POSITION: 3, AXIS: 2, ROTATION: 3}
-LONGEST, PIECES = 0.15, 2  # of an edge of trees [rad], and its chords
+LONGEST, PIECES = 0.3, 2  # of an edge of trees [rad], and its chords
+CONNECTED_BY = 0.15  # length of an edge of a connection [rad]
 MOST_EDGES = 200  # of a connection
 AT_ONCE = 8  # random states between two looks at the clock
 ORTHOGONAL = 1e-12
@@ -330,7 +331,8 @@ class ManifoldConnection:
     """Connections of states on the manifold of constraints, in edges as trees have them."""
 
     def __init__(
-        self, kernel: Kernel, rows: ConstraintRows, resolution: float, longest: float = LONGEST, pieces: int = PIECES
+        self, kernel: Kernel, rows: ConstraintRows, resolution: float, longest: float = CONNECTED_BY,
+        pieces: int = PIECES,
     ) -> None:  # fmt: skip
         """Connect states; arguments as of :class:`ConstrainedTreePair`."""
         self._kernel, self._resolution, self._longest = kernel, resolution, longest

@@ -114,7 +114,7 @@ class ConstrainedProposals:
         return None
 
 
-ITERATIONS, GROWTH = 2048, 1.5  # of trees in the first turn, and factor from turn to turn
+ITERATIONS, GROWTH = 32768, 1.5  # of trees in the first turn, and factor from turn to turn
 BETWEEN_TREES = 4  # most proposals in a turn that has trees, since each takes as long as some 500 iterations of them
 TEMPERATURES = (1.0, 1.6, 2.0)  # of proposals in one turn after the other
 
