@@ -153,7 +153,7 @@ def test_durations_are_lowered_within_limits_and_constraints(
     assert max(kept.use(limits).values()) <= 1.0 + 1e-9
     free = without.trajectory(ready.robot.joint_names)
     assert worst(free) > 5.0, "or the penalty shows nothing"
-    assert free.duration <= kept.duration
+    assert free.duration <= (1.0 + 1e-4) * kept.duration  # each is a local optimum
 
 
 def test_a_motion_beyond_a_constraint_is_named(ready: PlanningSetup, constraints: ConstraintSet) -> None:
