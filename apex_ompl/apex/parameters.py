@@ -21,6 +21,7 @@ TURN_CALLS = 1_000  # of the termination condition of a bridge where rounds and 
 QUICK_CALLS = 1500  # iterations of a bridge between rounds of proposals
 AGAIN = 8  # factor on the iterations of the sprint after the short repair of the first round
 SPRINT_FACTORS = (1, 8, 32)  # on those of the sprints before each round of proposals
+CONSTRAINED_SPRINT = 32  # the same under constraints, where the line and proposals take longer
 
 
 @register(NAME)
@@ -36,7 +37,8 @@ class ApexParameters(Parameters):
         device: Where the network runs.
         line: Whether the straight line is a candidate.
         sprint: Iterations that RRT-Connect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
-            after a short repair and before the second round it has 8 times as many, before the third 32 times.
+            after a short repair and before the second round it has 8 times as many, before the third 32 times; under
+            constraints 32 times at once.
             That is for trees in compiled code; OMPL's have an eighth.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
@@ -155,7 +157,7 @@ class ApexParameters(Parameters):
 
         found: list[Stage] = []
         if self.sprints:
-            found.append(stages.ConstrainedTrees(self.sprint))
+            found.append(stages.ConstrainedTrees(CONSTRAINED_SPRINT * self.sprint))
         if self.line:
             found.append(stages.ConstrainedLines())
         found += [stages.ConstrainedProposals(count) for count in self.batches[:1]]
