@@ -37,9 +37,8 @@ class ApexParameters(Parameters):
         device: Where the network runs.
         line: Whether the straight line is a candidate.
         sprint: Iterations that RRT-Connect has before proposals, where it is the fallback and ``lambda_obs`` is 0;
-            after a short repair and before the second round it has 8 times as many, before the third 32 times; under
-            constraints 32 times at once.
-            That is for trees in compiled code; OMPL's have an eighth.
+            after a short repair and before the second round it has 8 times as many, before the third 32 times;
+            under constraints 32 times at once. That is for trees in compiled code; OMPL's have an eighth.
         sampler: ``ddim``, ``dpm_solver`` or ``ddpm``; ``model`` takes that of the checkpoint.
         denoising_steps: Number of denoising steps; 0 takes that of the checkpoint: 2 for apex, all 256 for apex-paper.
         temperature: Factor on the standard deviation of the checkpoint's initial noise.
