@@ -153,7 +153,7 @@ class BagDriver:
     def _write_states(self, until: float) -> None:
         """Write the joint states up to a time [s] that were not written yet."""
         last = math.floor(until / self._spacing + 1e-9)
-        times = np.arange(self._count, last + 1) * self._spacing
+        times = np.asarray(np.arange(self._count, last + 1) * self._spacing, np.float64)
         self._count = last + 1
         for time, q, v in zip(times.tolist(), *self._robot.states(times), strict=True):
             message = self._types.types[STATE](
