@@ -201,11 +201,11 @@ def unit(suite: str, level: str, seeds: range, model: TrajectoryModel) -> Paths:
             problem = problems.load(f"{suite}/{level}/{seed}")
             setup = assemble(problem, robot())
             assert setup.constraints is not None
-            record = problem_record(problem, seed)
+            entry = problem_record(problem, seed)
             before = engine.counts["solved"]
-            engine.solve(ConstrainedFinder(setup, engine.optimizer), record)
+            engine.solve(ConstrainedFinder(setup, engine.optimizer), entry)
             if engine.counts["solved"] > before:
-                features[record.held] = told(robot(), setup.constraints).tolist()
+                features[entry.held] = told(robot(), setup.constraints).tolist()
                 sets.append(setup.constraints)
     paths = engine.paths(robot().name, robot().joint_names)
     counts = {"told": features, **_statistics(paths, sets, model)} if len(paths) else {"told": features}
