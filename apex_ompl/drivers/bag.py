@@ -15,15 +15,14 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.drivers.commands import START_TOLERANCE
-from apex_ompl.drivers.controllers import NANOSECONDS, Controllers
-from apex_ompl.drivers.driver import DriverState
+from apex_ompl.drivers.controllers import Controllers
 from apex_ompl.drivers.kinematic import KinematicDriver
 from apex_ompl.drivers.library import rosbags
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot.model import Robot
+from apex_ompl.timing.files import NANOSECONDS
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
-from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_number, check_positive
 
 RATE = 100.0  # of joint states [Hz]
@@ -32,15 +31,13 @@ TRAJECTORY, STATE = "trajectory_msgs/msg/JointTrajectory", "sensor_msgs/msg/Join
 STATES = "/joint_states"
 
 
-class BagDriver:
+class BagDriver(KinematicDriver):
     """A robot that is exactly where it is commanded to be, and writes what happens to a bag.
 
     Its time stands still until :meth:`advance`. The bag is complete after :meth:`close`; a folder that is there is
     never overwritten.
 
     Attributes:
-        names: Names of the joints.
-        limits: Limits of the joints.
         controllers: The controllers.
         path: Folder of the bag.
     """
@@ -68,8 +65,8 @@ class BagDriver:
         """
         check_positive(rate, "rate", "a positive number of states a second")
         check_number(zero, "zero", 0.0)
-        self._robot = KinematicDriver(robot, state, tolerance=tolerance)
-        self.names, self.limits, self.path = robot.joint_names, robot.limits, Path(path)
+        super().__init__(robot, state, tolerance=tolerance)
+        self.path = Path(path)
         self.controllers = Controllers(self.names, controllers, renamed)
         bags = rosbags()
         self._types, self._zero, self._spacing = bags.types, round(zero * NANOSECONDS), 1.0 / rate
@@ -82,49 +79,29 @@ class BagDriver:
         self._connections = {
             topic: self._writer.add_connection(topic, kind, typestore=bags.types) for topic, kind in topics.items()
         }
-        self._count, self._closed = 0, False
+        self._count = 0
         self._write_states(0.0)
-
-    def __repr__(self) -> str:
-        """Return the folder and the time."""
-        return one_line("BagDriver", repr(str(self.path)), f"{self.time:.3f} s")
-
-    @property
-    def time(self) -> float:
-        """Time on the driver's clock [s]."""
-        return self._robot.time
-
-    @property
-    def end(self) -> float:
-        """Time from which on rest is commanded [s]."""
-        return self._robot.end
 
     def advance(self, until: float) -> None:
         """Let the clock go on to a time [s], and write the joint states until then."""
-        check_number(until, "until", self.time, math.inf)
+        super().advance(until)
         self._write_states(until)
-        self._robot.advance(until)
-
-    def state(self) -> DriverState:
-        """Return the commanded state."""
-        return self._robot.state()
 
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`), and write its messages."""
-        self._robot.send(motion, at)
+        super().send(motion, at)
         self._write_motion(motion, at)
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
-        self._robot.stop()
-        self._write_motion(*self._robot.under_way())
+        with self._open():
+            self._write_motion(self._commands.stop(self.time), self.time)
 
     def close(self) -> None:
         """Complete the bag; other calls after it raise an ApexError."""
         if not self._closed:
-            self._closed = True
-            self._robot.close()
             self._writer.close()
+        super().close()
 
     def _stamp(self, time: float) -> Any:
         sec, nanosec = divmod(self._zero + round(time * NANOSECONDS), NANOSECONDS)
@@ -155,7 +132,7 @@ class BagDriver:
         last = math.floor(until / self._spacing + 1e-9)
         times = np.asarray(np.arange(self._count, last + 1) * self._spacing, np.float64)
         self._count = last + 1
-        for time, q, v in zip(times.tolist(), *self._robot.states(times), strict=True):
+        for time, q, v in zip(times.tolist(), *self._commands.states(times)[:2], strict=True):
             message = self._types.types[STATE](
                 header=self._header(time), name=self.controllers.ros_names, position=q, velocity=v, effort=np.empty(0)
             )

@@ -72,24 +72,21 @@ class Commands:
         kept = bisect_right(self._starts, at - CLOCK_ROUNDING)
         self._starts[kept:], self._motions[kept:] = [at], [motion]
 
-    def stop(self, now: float) -> None:
-        """Come to rest along the motion that is under way, and drop those that wait; the time is ``now`` [s]."""
-        k = max(bisect_right(self._starts, now) - 1, 0)
-        motion = self._motions[k]
-        if 0.0 < now - self._starts[k] < motion.duration:
-            motion = motion.stop_at(now - self._starts[k], self.limits)
-        self._starts[k:], self._motions[k:] = [self._starts[k]], [motion]
+    def stop(self, at: float) -> Trajectory:
+        """Come to rest along the motion that is under way at a time, from that time on [s], and drop those that wait.
 
-    def rest(self, at: float) -> Trajectory:
-        """Return the motion that is under way at a time, from that time on [s]."""
+        Returns:
+            The stop.
+        """
         k = max(bisect_right(self._starts, at) - 1, 0)
-        return self._motions[k].after(max(at - self._starts[k], 0.0))
-
-    def stopping(self, at: float) -> Trajectory:
-        """Return the stop along the motion that is under way at a time, from that time on [s]."""
-        k = max(bisect_right(self._starts, at) - 1, 0)
-        motion, since = self._motions[k], max(at - self._starts[k], 0.0)
-        return motion.stop_at(since, self.limits).after(since) if since < motion.duration else motion.after(since)
+        motion, since = self._motions[k], at - self._starts[k]
+        del self._starts[k + 1 :], self._motions[k + 1 :]
+        if not 0.0 <= since < motion.duration:
+            return motion.after(max(since, 0.0))
+        rest = motion.stop_at(since, self.limits).after(since)
+        self._starts.append(at)
+        self._motions.append(rest)
+        return rest
 
     def forget(self, now: float) -> None:
         """Drop motions that were replaced before a time [s], which ``states`` is not asked for again."""

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.timing.files import NANOSECONDS, check_controllers
+from apex_ompl.timing.knots import on_grid, spaced
 from apex_ompl.timing.trajectory import Trajectory
-from apex_ompl.util.arrays import distinct
 
-NANOSECONDS = 10**9
+CLOSEST = 1e-6  # knots that are nearer to each other are moved apart: their polynomials would be rounding alone [s]
 
 Point = tuple[int, list[float], list[float], list[float]]
 """Time from the start [ns], positions, velocities and accelerations."""
@@ -54,14 +55,8 @@ class Controllers:
             ParameterError: A joint has no controller, or more than one, or is unknown.
         """
         given = {controllers: names} if isinstance(controllers, str) else controllers
+        check_controllers(given, names)
         self.joints = {name: tuple(joints) for name, joints in given.items()}
-        moved = [joint for joints in self.joints.values() for joint in joints]
-        for joint in moved:
-            if joint not in names:
-                raise ParameterError("controllers", joint, f"joints of the robot: {', '.join(names)}")
-        for name in names:
-            if moved.count(name) != 1:
-                raise ParameterError("controllers", f"{moved.count(name)} for {name}", "one controller for each joint")
         other = dict(renamed or {})
         unknown = sorted({*other} - {*names})
         if unknown:
@@ -75,9 +70,10 @@ class Controllers:
         return [f"/{name}/joint_trajectory" for name in self.joints]
 
     def parts(self, motion: Trajectory) -> Iterator[ControllerMotion]:
-        """Yield what each controller gets of a motion; its times are whole nanoseconds, with the states of then."""
-        ticks = distinct(np.round(motion.times * NANOSECONDS).astype(np.int64))
-        states = motion.states(np.minimum(ticks / NANOSECONDS, motion.duration))
+        """Yield what each controller gets of a motion, at knots on whole nanoseconds, at least ``CLOSEST`` apart."""
+        near = np.diff(motion.times).min(initial=CLOSEST) < CLOSEST
+        times = spaced(motion.times, CLOSEST) if near else on_grid(motion.times)
+        ticks, states = np.rint(times * NANOSECONDS).astype(np.int64), motion.states(np.minimum(times, motion.duration))
         for topic, joints in zip(self.topics, self.joints.values(), strict=True):
             columns = [self._names.index(name) for name in joints]
             rows = np.moveaxis(states[:, :, columns], 1, 0).tolist()

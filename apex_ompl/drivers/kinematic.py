@@ -56,7 +56,7 @@ class KinematicDriver:
 
     def __repr__(self) -> str:
         """Return the time, and whether the driver is closed."""
-        return one_line("KinematicDriver", f"{self.time:.3f} s", "closed" if self._closed else "")
+        return one_line(type(self).__name__, f"{self.time:.3f} s", "closed" if self._closed else "")
 
     @property
     def time(self) -> float:
@@ -74,10 +74,11 @@ class KinematicDriver:
         Raises:
             ParameterError: The time is over, or the clock is the caller's.
         """
-        check_number(until, "until", self._time, math.inf)
-        if self._clock is not None:
-            raise ParameterError("until", until, "no call: the clock is the caller's")
-        self._time = until
+        with self._open():
+            check_number(until, "until", self._time, math.inf)
+            if self._clock is not None:
+                raise ParameterError("until", until, "no call: the clock is the caller's")
+            self._time = until
 
     def state(self) -> DriverState:
         """Return the commanded state."""
@@ -86,18 +87,6 @@ class KinematicDriver:
             self._commands.forget(now)
             position, velocity, _ = self._commands.states(np.array([now]))[:, 0]
             return DriverState(now, position, velocity)
-
-    def states(self, times: Array) -> tuple[Array, Array]:
-        """Return the commanded positions and velocities at increasing times from now on, shape (N, dof) each."""
-        with self._open():
-            position, velocity, _ = self._commands.states(times)
-            return position, velocity
-
-    def under_way(self) -> tuple[Trajectory, float]:
-        """Return the rest of the motion that is under way, and the time, from which on it is followed [s]."""
-        with self._open():
-            now = self.time
-            return self._commands.rest(now), now
 
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""

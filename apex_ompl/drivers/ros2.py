@@ -19,11 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
-from apex_ompl.drivers.controllers import NANOSECONDS, Controllers
+from apex_ompl.drivers.controllers import Controllers
 from apex_ompl.drivers.driver import DriverState
 from apex_ompl.drivers.library import rclpy
 from apex_ompl.errors import DriverError, ParameterError
 from apex_ompl.robot.model import Robot
+from apex_ompl.timing.files import NANOSECONDS
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
@@ -143,16 +144,17 @@ class Ros2Driver:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         self._check_open()
         with self._lock:
-            self._send(motion, at, self.time)
+            now = self.time
+            self._commands.send(motion, at, now)
+            self._commands.forget(now)
+            self._publish(motion, at)
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
         self._check_open()
         with self._lock:
-            now = self.time
-            start = now + self._lead
-            rest = self._commands.stopping(start)
-            self._send(rest, start, now)
+            start = self.time + self._lead
+            self._publish(self._commands.stop(start), start)
 
     def close(self) -> None:
         """Leave the robot to the motion that it follows, which ends at rest, and end the node."""
@@ -190,12 +192,16 @@ class Ros2Driver:
         return measured[1]
 
     def _take(self, message: Any) -> None:
-        """Take joint states, of all joints or of some."""
+        """Take joint states, of all joints or of some; without a stamp they are of now.
+
+        Velocities that are missing or NaN, as those of a broadcaster without that interface, are taken to be 0.
+        """
         stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
+        stamp = stamp or self._node.get_clock().now().nanoseconds
         speeds = message.velocity or [0.0] * len(message.name)
         for name, position, velocity in zip(message.name, message.position, speeds, strict=False):
-            if np.isfinite(position) and np.isfinite(velocity):
-                self._seen[name] = (stamp, position, velocity)
+            if np.isfinite(position):
+                self._seen[name] = (stamp, position, velocity if np.isfinite(velocity) else 0.0)
         rows = [self._seen.get(name) for name in self.controllers.ros_names]
         with self._arrived:
             if all(row is not None for row in rows):
@@ -203,9 +209,8 @@ class Ros2Driver:
                 self._measured = min(row[0] for row in rows if row is not None), found[:, 0], found[:, 1]
             self._arrived.notify_all()
 
-    def _send(self, motion: Trajectory, at: float, now: float) -> None:
-        self._commands.send(motion, at, now)
-        self._commands.forget(now)
+    def _publish(self, motion: Trajectory, at: float) -> None:
+        """Send each controller its part of a motion from a time on [s]."""
         start = self._zero + round(at * NANOSECONDS)
         for part in self.controllers.parts(motion):
             message = self._message(joint_names=part.joints)

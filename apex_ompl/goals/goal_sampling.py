@@ -24,6 +24,7 @@ from apex_ompl.kernel import IKDescents, IKSolver
 from apex_ompl.robot import Robot
 from apex_ompl.robot.rest_to_rest import direct_durations, direct_reach
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
 
 if TYPE_CHECKING:
     from apex_ompl.constraints.constraint_set import ConstraintSet
@@ -403,7 +404,7 @@ class _Search:
         part = np.arange(len(free))
         for row in depends[depends.any(axis=1)]:
             part[np.isin(part, part[row])] = part[row].min()
-        return [free[part == k] for k in np.unique(part[depends.any(axis=0)])]
+        return [free[part == k] for k in distinct(part[depends.any(axis=0)])]
 
     def _reach(self, states: Array) -> Array:
         """Return how far the joints move in the least duration to one of states, shape (dof,)."""

@@ -31,7 +31,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line, one_line
-from apex_ompl.util.validation import check_number, check_seed
+from apex_ompl.util.validation import check_number, check_seed, number_array
 
 TOLERANCE = 0.05  # largest distance of a joint from where it should be [rad]
 OUTCOMES = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT, "aborted": Outcome.ABORTED}
@@ -95,6 +95,8 @@ class Loop:
         """
         check_seed(seed)
         check_number(tolerance, "tolerance", 0.0, math.pi)
+        if not isinstance(problem, Problem):
+            raise ParameterError("problem", problem, "a Problem, as apex_ompl.load_problem returns it")
         if not isinstance(settings, LoopSettings):
             raise ParameterError("settings", settings, "a LoopSettings")
         replanning = method_of(method)
@@ -175,8 +177,16 @@ class Loop:
             stamp: When they were where they were seen, on the caller's clock [s].
             objects: The obstacles with their shapes where they were seen, by name, without velocities. A known obstacle
                 that is missing here was not seen, which tells nothing about where it is.
+
+        Raises:
+            ParameterError: The stamp is no number, or an object is no Obstacle.
         """
-        self._waiting.append(Observation(stamp, stamp, tuple(objects)))
+        seen = tuple(objects)
+        for one in seen:
+            if not isinstance(one, Obstacle):
+                raise ParameterError("objects", one, "obstacles")
+        at = float(number_array(stamp, "stamp", "a number"))
+        self._waiting.append(Observation(at, at, seen))
 
     def abort(self, why: str) -> None:
         """Let the robot come to rest and end the run for a reason; may be called from any thread."""

@@ -51,7 +51,9 @@ def encode(
             controller or two.
     """
     if controllers is not None:
-        _check_controllers(controllers, names, suffix)
+        if suffix not in MESSAGES:
+            raise ParameterError("controllers", suffix, f"a file name ending in {' or '.join(MESSAGES)}")
+        check_controllers(controllers, names)
     if suffix == ".npz":
         buffer = io.BytesIO()
         arrays: dict[str, Any] = {"times": times, "joint_names": np.array(names), **states}
@@ -179,9 +181,12 @@ def _from_table(text: str) -> tuple[Array, list[Array], tuple[str, ...]]:
     return table[:, 0], [table[:, 1 + k * dof : 1 + (k + 1) * dof] for k in range(len(STATES))], names
 
 
-def _check_controllers(controllers: Mapping[str, Sequence[str]], names: Sequence[str], suffix: str) -> None:
-    if suffix not in MESSAGES:
-        raise ParameterError("controllers", suffix, f"a file name ending in {' or '.join(MESSAGES)}")
+def check_controllers(controllers: Mapping[str, Sequence[str]], names: Sequence[str]) -> None:
+    """Check that controllers have lists of joints, together each of some names once.
+
+    Raises:
+        ParameterError: They have not.
+    """
     if not isinstance(controllers, Mapping) or any(isinstance(joints, str) for joints in controllers.values()):
         raise ParameterError("controllers", controllers, "lists of joints by the names of controllers")
     try:

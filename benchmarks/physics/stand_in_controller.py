@@ -2,26 +2,27 @@
 
 A trajectory starts at the stamp of its header, at once where that is 0, and replaces the one before at that time.
 Between points the polynomial of fifth degree is followed; after the last one the robot stays. Before the first point it
-is that from the state at the start. Joint states are published 200 times a second, and each is written to a file.
+is that from the state at the start. Joint states are published 200 times a second, and each is written to a file; the
+last joint has no velocity there (NaN), as where a robot has no such interface.
 
-Usage: python stand_in_controller.py FILE NAME JOINT=POSITION ...
+Usage: python -m benchmarks.physics.stand_in_controller FILE NAME JOINT=POSITION ...
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from typing import Any
 
 import numpy as np
 import rclpy
-from quintic import quintic  # of this folder: the program is run by its file
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
 
-NS = 10**9
+from benchmarks.timing.exported_motions import NANOSECONDS, Points, evaluated, quintics
 
 
 class Controller:
@@ -30,38 +31,28 @@ class Controller:
     def __init__(self, names: list[str], position: np.ndarray) -> None:
         """Rest at a position, shape (joints,)."""
         self.names = names
-        rest = np.stack([position, 0.0 * position, 0.0 * position])
-        self.plan: list[tuple[int, list[tuple[float, np.ndarray]]]] = [(0, [(0.0, rest)])]
+        self.plan = [(0, Points(np.zeros(1, np.int64), np.stack([position, 0 * position, 0 * position])[:, None], ()))]
 
     def take(self, message: Any, now: int) -> None:
         """Take a message at a time [ns]."""
-        stamp = message.header.stamp.sec * NS + message.header.stamp.nanosec
-        start = stamp or now
+        start = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec or now
         assert list(message.joint_names) == self.names
-        points = []
-        for point in message.points:
-            after = point.time_from_start.sec + point.time_from_start.nanosec / NS
-            points.append((after, np.array([point.positions, point.velocities, point.accelerations])))
-        if points[0][0] > 0.0:
-            points.insert(0, (0.0, self.state(start)))
-        self.plan = [one for one in self.plan if one[0] < start] + [(start, points)]
+        times = [point.time_from_start.sec * NANOSECONDS + point.time_from_start.nanosec for point in message.points]
+        states = [np.array([p.positions, p.velocities, p.accelerations]) for p in message.points]
+        if times[0] > 0:
+            times, states = [0, *times], [self.state(start), *states]
+        self.plan = [one for one in self.plan if one[0] < start]
+        self.plan.append((start, Points(np.array(times, np.int64), np.stack(states, axis=1), tuple(self.names))))
 
     def state(self, now: int) -> np.ndarray:
         """Return position, velocity and acceleration at a time [ns], shape (3, joints)."""
         start, points = [one for one in self.plan if one[0] <= now][-1]
-        since = (now - start) / NS
-        if since >= points[-1][0]:
-            state = points[-1][1].copy()
-            state[1:] = 0.0
-            return state
-        k = max(k for k, (time, _) in enumerate(points) if time <= since)
-        (first, before), (last, after) = points[k], points[k + 1]
-        c, t = quintic(last - first, before, after), since - first
-        powers = np.array(
-            [[t**k for k in range(6)], [k * t ** max(k - 1, 0) for k in range(6)],
-             [k * (k - 1) * t ** max(k - 2, 0) for k in range(6)]]
-        )  # fmt: skip
-        return powers @ c
+        k = int(np.searchsorted(points.nanoseconds, now - start, side="right")) - 1
+        if k == len(points.nanoseconds) - 1:
+            return np.concatenate([points.states[:1, -1], np.zeros_like(points.states[1:, -1])])
+        c, h = quintics(Points(points.nanoseconds[k : k + 2], points.states[:, k : k + 2], points.joints))
+        share = np.array([(now - start - points.nanoseconds[k]) / (points.nanoseconds[k + 1] - points.nanoseconds[k])])
+        return np.stack([evaluated(c, h, share, order)[0, 0] for order in range(3)])
 
 
 def main() -> None:
@@ -81,7 +72,8 @@ def main() -> None:
             rclpy.spin_once(node, timeout_sec=0.0)
             now = clock.now()
             state = controller.state(now.nanoseconds)
-            message = JointState(name=controller.names, position=state[0].tolist(), velocity=state[1].tolist())
+            velocity = [*state[1, :-1].tolist(), math.nan]
+            message = JointState(name=controller.names, position=state[0].tolist(), velocity=velocity)
             message.header.stamp = now.to_msg()
             states.publish(message)
             file.write(json.dumps([now.nanoseconds, *state[0].tolist()]) + "\n")

@@ -17,10 +17,10 @@ from apex_ompl.drivers import Ros2Driver
 from apex_ompl.robot import Robot
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
+from benchmarks.lib.record import ROOT
 
 PREFIX = "r_"  # of joints in ROS
-PROGRAM = Path(__file__).with_name("stand_in_controller.py")
-NANOSECONDS = 10**9
+PROGRAM = "benchmarks.physics.stand_in_controller"
 
 
 class StandIns:
@@ -39,8 +39,8 @@ class StandIns:
         home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
         for name, joints in self.joints.items():
             at = [f"{PREFIX}{joint}={home[joint]!r}" for joint in joints]
-            command = [sys.executable, str(PROGRAM), str(folder / name), name, *at]
-            self.processes.append(subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}))
+            command = [sys.executable, "-m", PROGRAM, str(folder / name), name, *at]
+            self.processes.append(subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}))
 
     def driver(self, **options: Any) -> Ros2Driver:
         """Return a driver that sends them motions."""

@@ -71,21 +71,22 @@ def test_a_controller_that_follows_the_messages_is_where_the_motions_are(
 ) -> None:
     folder, motion, rest = written
     messages = read(folder)
-    quintic = benchmark_script("physics.quintic").quintic
+    exported = benchmark_script("timing.exported_motions")
+    shares = np.array([0.2, 0.5, 0.9])
     for name, part in CONTROLLERS.items():
         sent = [message for _, message in messages[f"/{name}/joint_trajectory"]]
         assert len(sent) == 2
         for message, one in zip(sent, (motion, rest), strict=True):
             assert message.joint_names == [f"r_{joint}" for joint in robot.joint_names[part]]
-            times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points]
-            assert times[0] == 0.0 and all(a < b for a, b in zip(times, times[1:], strict=False))
-            rows = [np.array([p.positions, p.velocities, p.accelerations]) for p in message.points]
-            for begin, end, before, after in zip(times, times[1:], rows, rows[1:], strict=False):
-                coefficients = quintic(end - begin, before, after)
-                for share in (0.2, 0.5, 0.9):
-                    t = share * (end - begin)
-                    wanted = one(min(begin + t, one.duration))[part]
-                    assert np.abs(t ** np.arange(6) @ coefficients - wanted).max() < 1e-8
+            times = [p.time_from_start.sec * 10**9 + p.time_from_start.nanosec for p in message.points]
+            states = np.array([[p.positions, p.velocities, p.accelerations] for p in message.points])
+            points = exported.Points(np.array(times), np.moveaxis(states, 1, 0), tuple(message.joint_names))
+            assert times[0] == 0
+            coefficients, lengths = exported.quintics(points)
+            found = exported.evaluated(coefficients, lengths, shares, 0)
+            for begin, length, rows in zip(times, lengths[:, 0], found, strict=False):
+                for share, row in zip(shares, rows, strict=True):
+                    assert np.abs(row - one(min(begin / 1e9 + share * length, one.duration))[part]).max() < 1e-8
         starts = [message.header.stamp.sec * 10**9 + message.header.stamp.nanosec for message in sent]
         assert starts == [round(ZERO * 1e9) + round(1e9 * at) for at in (0.1, 0.1 + 0.5 * motion.duration)]
 
@@ -97,6 +98,6 @@ def test_a_folder_that_is_there_is_not_overwritten(robot: Robot, tmp_path: Path)
     assert [one.name for one in tmp_path.iterdir()] == ["kept"]
     with pytest.raises(ParameterError, match="rate: expected a positive number of states a second"):
         BagDriver(robot, tmp_path / "bag", rate=0.0)
-    with pytest.raises(ParameterError, match="controllers: expected one controller for each joint"):
+    with pytest.raises(ParameterError, match="controllers: expected each joint of the trajectory once"):
         BagDriver(robot, tmp_path / "bag", {"arm": robot.joint_names[:3]})
     assert not (tmp_path / "bag").exists()

@@ -138,6 +138,15 @@ def test_a_stop_in_the_middle_ends_at_rest_on_the_path(tried: Tried) -> None:
     tried.rests(end)
 
 
+def test_a_stop_at_the_start_of_a_motion_leaves_the_robot_at_rest(tried: Tried) -> None:
+    tried.driver.send(tried.motion((0, 0.6)), 0.0)
+    tried.driver.stop()
+    tried.driver.advance(0.2)
+    state = tried.driver.state()
+    assert np.abs(state.positions - tried.robot.home).max() < 1e-4 + tried.near  # the shortest stop that there is
+    tried.rests(state.positions)
+
+
 def test_what_cannot_be_followed_is_refused_and_changes_nothing(tried: Tried) -> None:
     motion, robot = tried.motion((0, 0.4)), tried.robot
     states = {name: getattr(motion, name) for name in ("positions", "velocities", "accelerations")}

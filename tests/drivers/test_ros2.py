@@ -135,7 +135,7 @@ def test_a_client_that_is_killed_leaves_the_robot_at_rest(robot: Robot, stand_in
 def test_robots_that_do_not_answer_are_named(robot: Robot) -> None:
     with pytest.raises(DriverError, match="no state of left_joint1, .* came on /joint_states in 0.3 s"):
         Ros2Driver(robot, "arms", started=0.3)
-    with pytest.raises(ParameterError, match="controllers: expected one controller for each joint"):
+    with pytest.raises(ParameterError, match="controllers: expected each joint of the trajectory once"):
         Ros2Driver(robot, {"arms": robot.joint_names[:3]})
     with pytest.raises(ParameterError, match="renamed: expected joints of"):
         Ros2Driver(robot, "arms", renamed={"elbow": "e"})

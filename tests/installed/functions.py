@@ -36,6 +36,7 @@ def run(root: Path) -> list[str]:
         _use_ompl()
         _use_steps()
         _use_run()
+        _use_drivers()
     (Path("tests")).symlink_to(root / "tests")  # data that a page reads
     for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
         code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(), re.S))
@@ -275,3 +276,21 @@ def _use_run() -> None:
         loop.abort("enough")
         assert loop.step(0.01) is not None and loop.outcome is not None and loop.reason == "enough"
         assert loop.events[-1].time <= 0.03
+
+
+def _use_drivers() -> None:
+    """An exact robot, and one that writes a bag; docs/drivers.md uses that of physics."""
+    import apex_ompl
+    from apex_ompl.drivers import BagDriver, KinematicDriver
+
+    robot = apex_ompl.load_robot("panda")
+    goal = robot.home + 0.2 * (np.arange(robot.dof) == 0)
+    motion = apex_ompl.time_path(np.stack([robot.home, goal]), robot.limits, robot.joint_names).trajectory
+    for driver in (KinematicDriver(robot), BagDriver(robot, "bag")):
+        driver.send(motion, 0.1)
+        driver.advance(0.2)
+        driver.stop()
+        driver.advance(driver.end)
+        assert not driver.state().velocities.any()
+        driver.close()
+    assert Path("bag/metadata.yaml").exists()

@@ -216,6 +216,7 @@ def test_periods_without_a_step_are_spent_on_the_stop() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [({"settings": LoopSettings()}, "settings: expected both"), ({"settings": 5}, "settings: expected a LoopSettings"),
+     ({"problem": "vertical/free/1"}, "problem: expected a Problem"),
      ({"tolerance": float("nan")}, "tolerance"), ({"seed": -1}, "seed"), ({"speed": 2.0}, "velocity_scale"),
      ({"problem": problems.load("carry_tray")}, "problem: expected no constraint")],
 )  # fmt: skip
@@ -235,3 +236,7 @@ def test_a_start_that_collides_and_times_that_are_no_numbers_are_refused() -> No
     with Loop(problem, ByHand(line), settings=SETTINGS, process=False) as loop:
         with pytest.raises(ParameterError, match="now"):
             loop.step(float("nan"))
+        with pytest.raises(ParameterError, match="objects: expected obstacles, got 'box'"):
+            loop.observe(0.0, ["box"])  # type: ignore[list-item]
+        with pytest.raises(ParameterError, match="stamp: expected a number"):
+            loop.observe("now", [])  # type: ignore[arg-type]
