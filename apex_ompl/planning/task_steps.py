@@ -37,7 +37,7 @@ ARC = np.radians(5.0)  # of a turn that a straight line replaces [rad]
 LATE = "the time is over"
 BLEND = 0.4  # of the way between two poses of a turn
 DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
-FINE = 1e-3  # spacing of the states at which that is examined [m]
+EXAMINED = 50  # states at which that is examined
 
 
 class StepFailed(Exception):  # noqa: N818 - an outcome, not an error
@@ -348,8 +348,8 @@ class StepPlanner:
         if not pairs:
             return replace(found, left=0.0)
         self._become(world, world.pairs - pairs)
-        self._check_depths(found.path, pairs, step)
         left, clearance = self._left(found, step, world)
+        self._check_depths(found, left, pairs)
         return replace(found, left=left, clearance=min(clearance, found.clearance))
 
     def _left(self, found: StepPlan, step: RetreatStep, world: TaskWorld) -> tuple[float, float]:
@@ -382,26 +382,30 @@ class StepPlanner:
                 high, clearance = middle, better
         return float(places[high]), clearance
 
-    def _check_depths(self, path: Path, pairs: frozenset[tuple[str, str]], step: RetreatStep) -> None:
-        """Check that contact with what a hand leaves does not become deeper along a path.
+    def _check_depths(self, plan: StepPlan, left: float, pairs: frozenset[tuple[str, str]]) -> None:
+        """Check that contact with what a hand leaves does not become deeper until it has left it.
+
+        Args:
+            plan: The retreat.
+            left: Where it has left it, a time or a number of states.
+            pairs: What may touch until then.
 
         Raises:
             StepFailed: It does.
         """
-        known = {frozenset(pair) for pair in pairs}
-        count = max(2, int(np.ceil(step.distance / FINE)) + 1)
-        places = np.linspace(0.0, len(path.states) - 1.0, count)
-        first = None
-        for place in places.tolist():
-            k = min(int(place), len(path.states) - 2) if len(path.states) > 1 else 0
-            after = path.states[min(k + 1, len(path.states) - 1)]
-            q = path.states[k] + (place - k) * (after - path.states[k])
-            found = [c for c in self.checker.contacts(q) if frozenset((c.first, c.second)) in known]
+        known, first, states = {frozenset(pair) for pair in pairs}, 0.0, plan.path.states
+        for k, place in enumerate(np.linspace(0.0, left, EXAMINED if left > 0.0 else 1).tolist()):
+            i = min(int(place), len(states) - 1)
+            q = states[i] + (place - i) * (states[min(i + 1, len(states) - 1)] - states[i])
+            q = q if plan.motion is None else plan.motion(place)
+            found = [] if self.checker.is_free(q) else self.checker.contacts(q)
+            found = [c for c in found if frozenset((c.first, c.second)) in known]
             depth = max((c.depth for c in found), default=0.0)
-            first = depth if first is None else first
+            first = depth if k == 0 else first
             if depth > first + DEEPER:
                 worst = max(found, key=lambda c: c.depth)
-                raise StepFailed(f"{worst.first} would go {1e3 * depth:.1f} mm deep into {worst.second}")
+                bodies = f"{worst.first} and {worst.second}"
+                raise StepFailed(f"{bodies} would overlap by {1e3 * depth:.1f} mm on the way", f"overlap {bodies}")
 
 
 def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
