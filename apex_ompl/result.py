@@ -161,6 +161,10 @@ class PlanResult:
         """Return these lines as a table for notebooks."""
         return _summary(self).html
 
+    def _step_rows(self) -> list[tuple[str, str]]:
+        """Return lines on steps after the goal; a plan to a goal has none."""
+        return []
+
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON; numbers that do not exist are None."""
         motion = self.trajectory
@@ -320,6 +324,7 @@ def _summary(result: PlanResult) -> Summary:
         )
         uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
         rows += [("motion", motion), ("limits", f"{uses} used")]
+    rows += result._step_rows()
     for name, bound in result.constraint_bound.items():
         rows.append(("constraint", f"{name}, violated by at most {bound:.3g}"))
     if result.dynamic_obstacles:

@@ -29,6 +29,7 @@ class _Bodies(StrictModel):
     scene: tuple[Obstacle, ...] = ()
     attached: tuple[AttachedObject, ...] = ()
     allowed: tuple[tuple[str, str], ...] = ()
+    leaving: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +46,9 @@ class TaskStep:
         scene: Obstacles during it, released objects among them.
         attached: Objects held during it.
         allowed: Pairs of bodies that may touch during it.
-        left: Time from which on a retreating hand no longer touches what it released, or without a motion the number of
-            the state of ``path``; NaN of other steps. It is proved clear of it from then on, and until then the pair is
-            among ``allowed``.
+        left: Time from which on a retreating hand is proved clear of what it released, or without a motion the number
+            of the state of ``path``; NaN of other steps.
+        leaving: Pairs among ``allowed`` that may touch until then only.
         released: Objects that its hand lets go of.
         grasped: Objects that its hand takes.
         gone: Released objects that planning no longer knows of from its end on, since they fall.
@@ -63,6 +64,7 @@ class TaskStep:
     attached: tuple[AttachedObject, ...]
     allowed: tuple[tuple[str, str], ...]
     left: float = nan
+    leaving: tuple[tuple[str, str], ...] = ()
     released: tuple[str, ...] = ()
     grasped: tuple[str, ...] = ()
     gone: tuple[str, ...] = ()
@@ -94,6 +96,7 @@ class TaskStep:
             "grasped": list(self.grasped), "gone": list(self.gone), "path": self.path.states.tolist(),
             "scene": [_plain(one) for one in changed], "removed": removed,
             "attached": [_plain(one) for one in self.attached], "allowed": [list(pair) for pair in self.allowed],
+            "leaving": [list(pair) for pair in self.leaving],
         }  # fmt: skip
 
     @classmethod
@@ -104,13 +107,14 @@ class TaskStep:
             ApexError: A body is faulty.
             KeyError, TypeError, ValueError: A field is missing or faulty.
         """
-        given = {name: data[name] for name in ("scene", "attached", "allowed")}
+        given = {name: data[name] for name in ("scene", "attached", "allowed", "leaving")}
         bodies = validate(_Bodies, given, source)
         changed, removed = {one.name: one for one in bodies.scene}, set(data["removed"])
         scene = {one.name: one for one in problem.scene if one.name not in removed} | changed
         return cls(
             kind=str(data["kind"]), title=str(data["title"]), path=Path(finite_array(data["path"], "path")),
             scene=tuple(scene.values()), attached=bodies.attached, allowed=bodies.allowed,
+            leaving=bodies.leaving,
             **{name: tuple(map(str, data[name])) for name in ("released", "grasped", "gone")},  # type: ignore[arg-type]
             **{n: nan if data[n] is None else float(data[n]) for n in ("start", "end", "clearance", "left")},  # type: ignore[arg-type]
         )  # fmt: skip
@@ -138,6 +142,17 @@ class TaskResult(PlanResult):
         motion = "" if self.trajectory is None else f"motion {self.trajectory.duration:.3f} s"
         titles = ", ".join(step.title for step in self.steps)
         return one_line("TaskResult", str(self.status), repr(self.problem.name), titles, motion, self.reason)
+
+    def _step_rows(self) -> list[tuple[str, str]]:
+        """Return a line on each step."""
+        rows = []
+        for step in self.steps:
+            change = f", {step.change}" if step.change else ""
+            rows.append(("step", f"{step.title}: {step.interval}, {1e3 * step.clearance:.2f} mm clear{change}"))
+        if self.goals_examined:
+            rejected = sum(self.goals_rejected.values())
+            rows.append(("goals", f"{self.goals_examined} examined, {rejected} rejected"))
+        return rows
 
     @classmethod
     def of(cls, result: PlanResult) -> TaskResult:

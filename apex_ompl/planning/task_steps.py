@@ -95,7 +95,9 @@ class StepPlanner:
         problem: The problem.
     """
 
-    def __init__(self, checker: CollisionChecker, problem: Problem, deadline: Deadline, pressed: Callable[[], bool]) -> None:
+    def __init__(
+        self, checker: CollisionChecker, problem: Problem, deadline: Deadline, pressed: Callable[[], bool]
+    ) -> None:
         """Plan by ``checker`` until a deadline, or until ``pressed`` holds."""
         self.checker, self.problem = checker, problem
         self._deadline, self._pressed = deadline, pressed
@@ -313,9 +315,7 @@ class StepPlanner:
             return check.reason
 
         try:
-            made = time_path(
-                states, limits, self.robot.joint_names, how, fault, stop=self._ends, motion_limits=more
-            )
+            made = time_path(states, limits, self.robot.joint_names, how, fault, stop=self._ends, motion_limits=more)
         except TimingError as error:
             raise StepFailed(f"it cannot be timed, {error}") from None
         motion = made.trajectory
@@ -411,9 +411,7 @@ class StepPlanner:
 def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
     """Return the radius of blends between poses: a share of the shortest way of a frame from one to the next [m]."""
     ways = [
-        length(following[name][:3, 3] - pose[:3, 3])
-        for one, following in pairwise(poses)
-        for name, pose in one.items()
+        length(following[name][:3, 3] - pose[:3, 3]) for one, following in pairwise(poses) for name, pose in one.items()
     ]
     return BLEND * min((way for way in ways if way > SAME_POINT), default=0.0)
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from apex_ompl.constraints.frames import LinkFace, frame_of
 from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
+from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
-from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep
 from apex_ompl.types import Array
@@ -185,7 +185,9 @@ def check_steps(robot: Robot, problem: Problem) -> None:
                 workspace_goal(robot, moved)
                 moved.goal_states(robot.joint_names)
             except ApexError as error:
-                raise FileFormatError(problem.source, f"after.{k}.goal", str(error), "expected a possible goal") from None
+                raise FileFormatError(
+                    problem.source, f"after.{k}.goal", str(error), "expected a possible goal"
+                ) from None
         world = world.after(step, q)
 
 

@@ -11,27 +11,28 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from math import nan
+from math import isnan, nan
 from typing import NamedTuple
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.goal_sampling import sample
-from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
 from apex_ompl.ompl.process import Interrupt, quiet_ompl
+from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.planner import PlanOptions
 from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepFailed, StepPlan, StepPlanner
 from apex_ompl.planning.task_world import TaskWorld, check_steps
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.robot import Robot
+from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, ReleaseStep
-from apex_ompl.timing import Timing
+from apex_ompl.scene.steps import GraspStep, ReleaseStep, RetreatStep
+from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.trajectory import joined
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
@@ -282,6 +283,31 @@ def _end(plans: Sequence[StepPlan], q: Array) -> Array:
     return plans[-1].end if plans else q
 
 
+def task_fault(result: TaskResult, motion: Trajectory) -> str:
+    """Return why a motion with the times of a task's steps is not free in the scenes of these, or an empty text.
+
+    Args:
+        result: The task.
+        motion: A motion such as its own, or that at another rate.
+    """
+    robot = load_robot(result.problem.robot)
+    for step in result.steps:
+        checker = CollisionChecker(robot, step.scene, step.attached, step.allowed)
+        check = full_check(checker, _between(motion, step.start, step.end))
+        if check and not isnan(step.left):
+            for pair in step.leaving:
+                checker.allow(*pair, allowed=False)
+            check = full_check(checker, _between(motion, step.left, step.end))
+        if not check:
+            return f"{step.title}: {check.reason}"
+    return ""
+
+
+def _between(motion: Trajectory, start: float, end: float) -> Trajectory:
+    """Return the part of a motion between two times [s]."""
+    return motion.before(end).after(start)
+
+
 def _whole(found: PlanResult, plans: list[StepPlan], robot: Robot, problem: Problem) -> TaskResult:
     """Return the result of a task from the plan to its goal and the plans of the steps after it."""
     motion, path = found.trajectory, found.path
@@ -311,13 +337,14 @@ def _whole(found: PlanResult, plans: list[StepPlan], robot: Robot, problem: Prob
 def _step(plan: StepPlan, start: float, end: float, left: float) -> TaskStep:
     """Return the record of a step that was planned."""
     step, world, after = plan.step, plan.world, plan.after
-    released = grasped = ()
+    released, grasped = tuple[str, ...](), tuple[str, ...]()
     if isinstance(step, ReleaseStep):
         released = step.objects or world.held_by(step.hand)
     elif isinstance(step, GraspStep):
         grasped = (step.object,)
+    leaving = world.leaving_pairs(step.hand) if isinstance(step, RetreatStep) else ()
     gone = tuple(name for name in released if name not in after.scene and name not in after.held)
     return TaskStep(
         step.kind, step.title, start, end, plan.path, plan.clearance, tuple(world.scene.values()),
-        tuple(world.held.values()), tuple(sorted(world.pairs)), left, released, grasped, gone,
+        tuple(world.held.values()), tuple(sorted(world.pairs)), left, tuple(sorted(leaving)), released, grasped, gone,
     )  # fmt: skip

@@ -1,6 +1,6 @@
-"""Steps after the goal of a problem: what problem files write as ``after``, but for ``move``, which has a goal of its own.
+"""Steps after the goal of a problem: what problem files write as ``after``.
 
-Each starts at rest in the last state of the one before it, and ends at rest. A frame is named after a hand, a link or
+``move``, which has a goal, is defined beside goals, in :mod:`apex_ompl.scene.problem`. Each starts at rest in the last state of the one before it, and ends at rest. A frame is named after a hand, a link or
 a held object, see :func:`apex_ompl.constraints.frames.frame_of`. Lengths are in meters, the world has z up.
 """
 
@@ -8,7 +8,14 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from apex_ompl.scene.bodies import Coordinate, Direction, Name, Size
 from apex_ompl.util.schema import StrictModel
@@ -234,4 +241,3 @@ class WaitStep(Step):
     def subject(self) -> str:
         """The time."""
         return f"{self.seconds:g} s"
-
