@@ -36,6 +36,7 @@ MOST_ADVANCES = 500
 ARC = np.radians(5.0)  # of a turn that a straight line replaces [rad]
 LATE = "the time is over"
 BLEND = 0.4  # of the way between two poses of a turn
+HAND_ROOM = 1e-4  # to the limits of a synergy, which motions at another rate need at rests
 DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
 EXAMINED = 50  # states at which that is examined
 
@@ -268,7 +269,9 @@ class StepPlanner:
                 to = self._closed(during, step, q)
         end = q.copy()
         if synergy is not None and to is not None:
-            end[self.robot.joint_names.index(synergy)] = to
+            k, limits = self.robot.joint_names.index(synergy), self.robot.limits
+            wanted = float(np.clip(to, limits.lower[k] + HAND_ROOM, limits.upper[k] - HAND_ROOM))
+            end[k] = q[k] if abs(wanted - q[k]) <= HAND_ROOM else wanted
         states = np.stack([q, end]) if (end != q).any() else q[None]
         self._become(during)
         check = full_check(self.checker, states, q, [end], deadline=self._deadline.at)

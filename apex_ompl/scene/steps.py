@@ -1,7 +1,8 @@
 """Steps after the goal of a problem: what problem files write as ``after``.
 
-``move``, which has a goal, is defined beside goals, in :mod:`apex_ompl.scene.problem`. Each starts at rest in the last state of the one before it, and ends at rest. A frame is named after a hand, a link or
-a held object, see :func:`apex_ompl.constraints.frames.frame_of`. Lengths are in meters, the world has z up.
+Each starts at rest in the last state of the one before it, and ends at rest. A frame is named after a hand, a link or
+a held object, see :func:`apex_ompl.constraints.frames.frame_of`. Lengths are in meters, the world has z up. Motions to
+further goals are defined beside these, in :mod:`apex_ompl.scene.problem`.
 """
 
 from __future__ import annotations
