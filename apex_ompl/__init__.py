@@ -1,8 +1,8 @@
 """APEX for OMPL: dual-arm planning with latent diffusion, real meshes and proven paths.
 
-``plan`` solves a problem, ``plan_task`` goes on with the steps after its goal, ``run`` goes to a goal in closed loop while
-obstacles move, ``load_problem`` reads a problem, ``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads a
-trained model, ``time_path`` times any path, ``view`` shows results in the browser. Planners are in
+``plan`` solves a problem, ``plan_task`` goes on with the steps after its goal, ``run`` goes to a goal in closed loop
+while obstacles move, ``load_problem`` reads a problem, ``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads
+a trained model, ``time_path`` times any path, ``view`` shows results in the browser. Planners are in
 ``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``; docs/README.md lists the other packages with
 public names.
 """

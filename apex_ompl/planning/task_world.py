@@ -16,6 +16,7 @@ from apex_ompl.constraints.frames import LinkFace, frame_of
 from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.robot import Robot
+from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep
@@ -59,7 +60,8 @@ class TaskWorld:
 
     def leaving_pairs(self, hand: str) -> frozenset[Pair]:
         """Return the pairs of the links of a hand and the objects that it is leaving."""
-        links = hand_links(self.robot, hand)
+        solid = {link_of(self.robot.model, item) for item in self.robot.geometry.geometryObjects}
+        links = [link for link in hand_links(self.robot, hand) if link in solid]
         return frozenset((link, name) for name in self.leaving.get(hand, ()) for link in links)
 
     def held_by(self, hand: str) -> tuple[str, ...]:

@@ -187,7 +187,7 @@ class ReleaseStep(Step):
 
 
 class GraspStep(Step):
-    """A hand closes on an obstacle, or on an object that another hand holds, and holds it from then on.
+    """A hand closes on an obstacle, or on an object that another hand holds, and holds it.
 
     Attributes:
         hand: Name of the hand.
