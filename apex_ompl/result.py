@@ -222,7 +222,7 @@ class PlanResult:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> PlanResult:
-        """Read a result that was saved as .npz, .json or .yaml.
+        """Read a result that was saved as .npz, .json or .yaml; that of a task as :class:`apex_ompl.TaskResult`.
 
         Raises:
             MissingFileError: The file cannot be read.
@@ -238,6 +238,10 @@ class PlanResult:
         else:
             data = (read_json if path.suffix == ".json" else read_yaml)(path, "result file")
         check_version(data, SCHEMA, path)
+        if "task" in data and cls is PlanResult:
+            from apex_ompl.planning.task_result import TaskResult
+
+            return TaskResult.load(path)
         older: dict[str, Any] = {
             "clearance_pair": ["", ""],
             "timing_method": "",

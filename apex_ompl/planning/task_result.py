@@ -9,11 +9,13 @@ from dataclasses import dataclass, field, fields, replace
 from math import isnan, nan
 from typing import Any
 
-from apex_ompl.errors import ApexError, FileFormatError
+from apex_ompl.errors import ApexError, FileFormatError, ParameterError
 from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult
+from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
 from apex_ompl.util.files import BROKEN, read_archive
 from apex_ompl.util.schema import StrictModel, read_json, read_yaml, validate
@@ -164,6 +166,39 @@ class TaskResult(PlanResult):
         """Time at which the goal is reached [s]; NaN without a motion."""
         return self.steps[0].end if self.steps else nan
 
+    def step_at(self, time: float) -> TaskStep:
+        """Return the step at a time [s]: the first one before the start, the last one after the end.
+
+        Raises:
+            ParameterError: The task was not planned, or is not timed.
+        """
+        if not self.steps or isnan(self.goal_time):
+            raise ParameterError("result", str(self.status), "a task with a timed motion")
+        return next((step for step in self.steps if time < step.end), self.steps[-1])
+
+    def object_poses(self, robot: Robot, time: float) -> dict[str, Array | None]:
+        """Return the poses in the world of all objects that are held at some time, shape (4, 4); None of fallen ones.
+
+        Args:
+            robot: The robot of the problem.
+            time: A time of the motion [s].
+
+        Raises:
+            ParameterError: The task was not planned, or is not timed.
+        """
+        step, motion = self.step_at(time), self.trajectory
+        assert motion is not None
+        over = step is self.steps[-1] and time >= step.end  # what falls at the end of the last step is gone then
+        held, q = {one.name: one for one in step.attached}, motion(time)
+        standing = {one.name: one.pose for one in step.scene}
+        found: dict[str, Array | None] = {}
+        for name in dict.fromkeys(one.name for some in self.steps for one in some.attached):
+            if name in held and not (over and name in step.gone):
+                found[name] = robot.link_pose(q, held[name].link) @ held[name].pose
+            else:
+                found[name] = standing.get(name)
+        return found
+
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON."""
         steps = [step.as_dict(self.problem) for step in self.steps]
@@ -172,7 +207,7 @@ class TaskResult(PlanResult):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TaskResult:
-        """Read a result that was saved as .npz, .json or .yaml.
+        """Read a result that was saved as .npz, .json or .yaml; :meth:`apex_ompl.PlanResult.load` reads tasks too.
 
         Raises:
             ApexError: As :meth:`apex_ompl.PlanResult.load`, or the file holds no task.
