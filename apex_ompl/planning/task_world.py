@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.constraints.frames import LinkFace, frame_of
-from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
+from apex_ompl.errors import ApexError, FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl.setup import workspace_goal
+from apex_ompl.planning.line_query import tools_of
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
@@ -231,6 +232,10 @@ def _frame_faults(world: TaskWorld, step: LineStep | TurnStep) -> Iterable[tuple
             return
         if isinstance(step, LineStep) and step.gap is not None and name not in world.held:
             yield "gap", step.gap, f"expected none, since {name!r} is no held object"
+    try:
+        tools_of(robot, step.frame, [frame_of(robot, name, world.held) for name in step.frame])
+    except ParameterError as error:
+        yield "frame", error.value, f"expected {error.expected}"
     onto = step.onto if isinstance(step, LineStep) else None
     for name in (step.frame[0], onto) if onto is not None else ():
         if world.face(name, robot.home) is None:

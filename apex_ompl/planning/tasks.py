@@ -42,9 +42,8 @@ from apex_ompl.util.process import running
 WANTED = 3  # goals from which all steps can be done, among which the planner chooses
 EXAMINATION = 0.5  # of the time, at most, for the search for these goals once one is found
 PER_GOAL = 0.5  # of the timeout, for the steps from one goal
-ROUNDS = 50  # of sampling goals
+ROUNDS = 7  # of sampling goals, after those of the set-up
 MOST_CAUSES = 3  # that a reason names
-LEAST_TIME = 1e-3  # of a plan [s]
 WORDS = "no goal was found from which the steps after it can be done"
 
 PlanTo = Callable[[Problem, float, bool], PlanResult]
@@ -126,6 +125,7 @@ class TaskPlanner:
             self._problem, self._checker.robot, seed=given.seed, group=given.group, checker=self._checker,
             constraints=given.constraints,
         )  # fmt: skip
+        self._deadline.restart(given.timeout)
         fault = query_fault(setup)[0]
         leaves = given.leave_contact and setup.start_fault
         if fault is not None and not leaves:
@@ -154,7 +154,9 @@ class TaskPlanner:
         with self._interruptible():
             goals = self._goals(setup, world, stage.steps)
         while goals:
-            time = max(self._deadline.remaining - self._deadline.reserve, LEAST_TIME)
+            time = self._deadline.for_search
+            if time <= 0.0:
+                break
             self._checker.become(world.scene, world.held, world.pairs)
             found = self._plan_to(self._to(setup.problem, goals), time, k == 0)
             if not found or found.path is None:
@@ -182,7 +184,7 @@ class TaskPlanner:
         move = self._stages[k].move
         problem = world.problem(self._problem, move.goal, q)
         self._checker.become(world.scene, world.held, world.pairs)
-        with unforked(), quiet_ompl():
+        with unforked(), quiet_ompl(), self._deadline.paused():
             setup = assemble(problem, self._checker.robot, seed=self._options.seed, checker=self._checker)
         status, reason, _ = query_fault(setup)
         if status is not None:
@@ -248,13 +250,12 @@ class TaskPlanner:
         """Return the result of a task whose steps cannot be done."""
         counts = self.rejected.most_common(MOST_CAUSES)
         causes = "; ".join(f"{cause} ({n} of {self.examined} goals)" for cause, n in counts)
+        robot, status = self._checker.robot, PlanStatus.STEP_FAILED
         if self._deadline.for_search <= 0.0:
-            reason = f"{reason} in {self._options.timeout:g} s"
-        robot = self._checker.robot
+            reason, status = f"the task was not planned in {self._options.timeout:g} s", PlanStatus.TIMEOUT
         made = TaskResult(
-            status=PlanStatus.STEP_FAILED, reason=f"{reason}; {causes}" if causes else reason, problem=self._problem,
-            robot=robot.name, joint_names=robot.joint_names, planner="task", seed=self._options.seed,
-            robot_digest=digest(robot),
+            status=status, reason="; ".join(filter(None, [reason, causes])), problem=self._problem, robot=robot.name,
+            joint_names=robot.joint_names, planner="task", seed=self._options.seed, robot_digest=digest(robot),
         )  # fmt: skip
         return self._said(made)
 
@@ -330,7 +331,7 @@ def _whole(found: PlanResult, plans: list[StepPlan], robot: Robot, problem: Prob
     return replace(
         result, trajectory=whole, limit_use=use | dict(whole.use(robot.limits)),
         motion_clearance=min(step.clearance for step in steps),
-        deviation=max(found.deviation, *(plan.deviation for plan in plans)),
+        deviation=max([found.deviation, *(plan.deviation for plan in plans)]),
     )  # fmt: skip
 
 
