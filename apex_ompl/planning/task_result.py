@@ -207,17 +207,14 @@ class TaskResult(PlanResult):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TaskResult:
-        """Read a result that was saved as .npz, .json or .yaml; :meth:`apex_ompl.PlanResult.load` reads tasks too.
+        """Read a result that was saved as .npz, .json or .yaml.
 
         Raises:
             ApexError: As :meth:`apex_ompl.PlanResult.load`, or the file holds no task.
         """
         found, file = super().load(path), os.fspath(path)
         assert isinstance(found, TaskResult)
-        if file.endswith(".npz"):
-            data = read_archive(pathlib.Path(file), "result", "result file")[0]
-        else:
-            data = (read_json if file.endswith(".json") else read_yaml)(pathlib.Path(file), "result file")
+        data = _data_of(file)
         try:
             task = data["task"]
             steps = tuple(TaskStep.of_dict(one, found.problem, file) for one in task["steps"])
@@ -225,6 +222,24 @@ class TaskResult(PlanResult):
             return replace(found, steps=steps, goals_examined=int(task["goals_examined"]), goals_rejected=rejected)
         except (*BROKEN, ApexError, AttributeError) as error:
             raise FileFormatError(file, "task", str(error), "expected the result of a task") from error
+
+
+def load_result(path: str | os.PathLike[str]) -> PlanResult:
+    """Read a saved result of a plan, or that of a task as a :class:`TaskResult`.
+
+    Raises:
+        ApexError: As :meth:`apex_ompl.PlanResult.load`.
+    """
+    found = PlanResult.load(path)
+    return TaskResult.load(path) if "task" in _data_of(os.fspath(path)) else found
+
+
+def _data_of(file: str) -> dict[str, Any]:
+    """Return the record of a saved result."""
+    if file.endswith(".npz"):
+        return read_archive(pathlib.Path(file), "result", "result file")[0]
+    data: dict[str, Any] = (read_json if file.endswith(".json") else read_yaml)(pathlib.Path(file), "result file")
+    return data
 
 
 def _number(value: float) -> float | None:

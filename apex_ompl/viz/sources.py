@@ -12,7 +12,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import ARCHIVE, RunResult
-from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.planning.task_result import TaskResult, load_result
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import load_same_robot
@@ -58,7 +58,7 @@ def load_saved(path: Path) -> Saved:
         FileFormatError: It holds neither.
         ParameterError: It has another suffix.
     """
-    return (saved_kind(path) or PlanResult).load(path)
+    return RunResult.load(path) if saved_kind(path) is RunResult else load_result(path)
 
 
 def robot_of(saved: Saved) -> Robot:

@@ -15,6 +15,7 @@ from tasks import Checker, contacts, poses
 
 from apex_ompl import MotionPlanner, PlanResult, PlanStatus, TaskResult, Timing, plan_task
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.planning.task_result import load_result
 from apex_ompl.planning.task_world import check_steps
 from apex_ompl.planning.tasks import task_fault
 from apex_ompl.robot import Robot
@@ -310,8 +311,11 @@ def test_a_task_is_saved_and_read(tmp_path: Path, robot: Robot, suffix: str) -> 
     result = planned("pack_bin")
     file = tmp_path / f"task{suffix}"
     result.save(file)
-    found = PlanResult.load(file)
-    assert isinstance(found, TaskResult) and found.as_dict() == result.as_dict()
+    found = TaskResult.load(file)
+    assert found.as_dict() == result.as_dict() and isinstance(load_result(file), TaskResult)
+    to_goal = PlanResult.load(file)
+    assert not isinstance(to_goal, TaskResult) and result.path is not None and to_goal.length == result.length
+    assert to_goal.trajectory is not None and np.array_equal(to_goal.trajectory.positions[-1], result.path.states[-1])
     assert found.steps[-1].scene == result.steps[-1].scene and found.steps[-1].attached == ()
     assert found.trajectory is not None and task_fault(found, found.trajectory) == ""
 
