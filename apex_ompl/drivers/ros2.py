@@ -147,7 +147,7 @@ class Ros2Driver:
         with self._lock:
             now = self.time
             self._commands.send(motion, at, now)
-            self._commands.forget(now)
+            self._commands.forget(now - self._silence)
             self._publish(motion, at)
 
     def positions(self, at: float) -> Array:
@@ -165,7 +165,10 @@ class Ros2Driver:
         return first + (stamp - before) / (after - before) * (second - first)
 
     def commanded(self, at: float) -> Array:
-        """Return the commanded positions, velocities and accelerations at a time, now or later [s], shape (3, dof)."""
+        """Return the commanded positions, velocities and accelerations at a time [s], shape (3, dof).
+
+        Times from ``silence`` ago on are known.
+        """
         self._check_open()
         with self._lock:
             return self._commands.states(np.array([at]))[:, 0]

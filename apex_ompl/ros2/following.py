@@ -175,10 +175,7 @@ class Follower:
             state = driver.state()
         except DriverError as error:
             return Ended("aborted", str(error))
-        if self.motion is None or state.stamp < self.motion_start:
-            return None
-        wanted = self.motion(min(state.stamp - self.motion_start, self.motion.duration))
-        off = np.abs(state.positions - wanted)
+        off = np.abs(state.positions - driver.commanded(state.stamp)[0])
         if off.max() <= self.settings().tolerance:
             return None
         k = int(off.argmax())
@@ -226,16 +223,22 @@ class Follower:
             loop.abort(CHANGED)
         for stamp, obstacles in self.scene.observations(self.state_at):
             loop.observe(float(self.driver.times_of(stamp)), obstacles)
-        command = loop.step(self.driver.time, self._measured())
+        now = self.driver.time
+        command = loop.step(now, self._measured(now))
         if command is not None:
             self._send(loop, command)
 
-    def _measured(self) -> Array:
-        """Return the measured positions, which are NaN where the robot is silent, shape (dof,)."""
+    def _measured(self, now: float) -> Array:
+        """Return the positions at a time that has just come [s], shape (dof,): those commanded, off by as much as at the last measurement.
+
+        They are NaN where the robot is silent.
+        """
+        driver = self.driver
         try:
-            return self.driver.state().positions
+            state = driver.state()
         except DriverError:
-            return np.full(len(self.driver.names), np.nan)
+            return np.full(len(driver.names), np.nan)
+        return driver.commanded(now)[0] + state.positions - driver.commanded(state.stamp)[0]
 
     def _send(self, loop: Loop, command: Command) -> None:
         """Send a command; where it is too late the loop follows the one before."""

@@ -42,6 +42,7 @@ class NodeSettings:
         error: Largest error of observed places [m].
         fastest: Largest speed of obstacles [m/s].
         timeout: Time after which the closed loop gives up [s].
+        stuck: Time of rest after which the closed loop gives up [s].
         speed: Share of the velocity limits.
         planning_time: Time for a plan [s].
         lead: Time between a plan and the start of its motion [s].
@@ -67,6 +68,7 @@ class NodeSettings:
     error: float = _known(0.02, "largest error of observed places [m]", 0.0, 0.5)
     fastest: float = _known(0.5, "largest speed of obstacles [m/s]", 0.0, 5.0)
     timeout: float = _known(60.0, "time after which the closed loop gives up [s]", 0.1, 600.0)
+    stuck: float = _known(10.0, "time of rest after which the closed loop gives up [s]", 0.1, 600.0)
     speed: float = _known(0.5, "share of the velocity limits", 0.001, 1.0)
     planning_time: float = _known(5.0, "time for a plan [s]", 0.01, 600.0)
     lead: float = _known(0.05, "time between a plan and the start of its motion [s]", 0.005, 10.0)
@@ -95,7 +97,7 @@ class NodeSettings:
     @property
     def loop(self) -> LoopSettings:
         """Settings of the closed loop."""
-        return LoopSettings(error=self.error, fastest=self.fastest, timeout=self.timeout)
+        return LoopSettings(error=self.error, fastest=self.fastest, timeout=self.timeout, stuck=self.stuck)
 
     def poses(self) -> dict[str, Array]:
         """Return the poses of frames in the world, shape (4, 4) [m].

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import threading
 import time
 from typing import Any
 
@@ -30,7 +31,7 @@ class Controller:
 
     def __init__(self, names: list[str], position: np.ndarray) -> None:
         """Rest at a position, shape (joints,)."""
-        self.names = names
+        self.names, self.lock = names, threading.Lock()
         self.plan = [(0, Points(np.zeros(1, np.int64), np.stack([position, 0 * position, 0 * position])[:, None], ()))]
 
     def take(self, message: Any, now: int) -> None:
@@ -41,12 +42,14 @@ class Controller:
         states = [np.array([p.positions, p.velocities, p.accelerations]) for p in message.points]
         if times[0] > 0:
             times, states = [0, *times], [self.state(start), *states]
-        self.plan = [one for one in self.plan if one[0] < start]
-        self.plan.append((start, Points(np.array(times, np.int64), np.stack(states, axis=1), tuple(self.names))))
+        points = Points(np.array(times, np.int64), np.stack(states, axis=1), tuple(self.names))
+        with self.lock:
+            self.plan = [*(one for one in self.plan if one[0] < start), (start, points)]
 
     def state(self, now: int) -> np.ndarray:
         """Return position, velocity and acceleration at a time [ns], shape (3, joints)."""
-        start, points = [one for one in self.plan if one[0] <= now][-1]
+        with self.lock:
+            start, points = [one for one in self.plan if one[0] <= now][-1]
         k = int(np.searchsorted(points.nanoseconds, now - start, side="right")) - 1
         if k == len(points.nanoseconds) - 1:
             return np.concatenate([points.states[:1, -1], np.zeros_like(points.states[1:, -1])])
@@ -67,9 +70,9 @@ def main() -> None:
         JointTrajectory, f"/{name}/joint_trajectory", lambda m: controller.take(m, clock.now().nanoseconds), 10
     )
     states = node.create_publisher(JointState, "/joint_states", qos_profile_sensor_data)
+    threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
     with open(path, "w") as file:  # noqa: PTH123
         while rclpy.ok():
-            rclpy.spin_once(node, timeout_sec=0.0)
             now = clock.now()
             state = controller.state(now.nanoseconds)
             velocity = [*state[1, :-1].tolist(), math.nan]

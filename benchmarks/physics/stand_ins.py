@@ -47,6 +47,12 @@ class StandIns:
         renamed = {name: PREFIX + name for name in self.robot.joint_names}
         return Ros2Driver(self.robot, self.joints, renamed=renamed, **{"started": 60.0, "silence": 10.0} | options)
 
+    def parameters(self) -> list[str]:
+        """Return the arguments by which the node ``apex-ompl ros2`` knows them."""
+        controllers = [f"{name}={','.join(joints)}" for name, joints in self.joints.items()]
+        renamed = [f"{name}={PREFIX}{name}" for name in self.robot.joint_names]
+        return ["-p", f"controllers:={controllers}", "-p", f"renamed:={renamed}"]
+
     def close(self) -> None:
         """End them."""
         for process in self.processes:
