@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import rclpy
@@ -48,8 +48,8 @@ class Client:
         trajectories: Times of arrival on the monotonic clock [s], and trajectories, by controller.
     """
 
-    def __init__(self, topics: Sequence[str] = (*TYPES,), controllers: Sequence[str] = ()) -> None:
-        """Start publishers of some topics, and listen to the controllers' topics."""
+    def __init__(self, topics: Sequence[str] = (*TYPES,)) -> None:
+        """Start publishers of some topics."""
         self.outcomes, self.diagnostics, self.markers = list[str](), list[Any](), list[Any]()
         self.trajectories: list[tuple[float, str, Any]] = []
         self.context = rclpy.Context()
@@ -66,8 +66,6 @@ class Client:
         self.node.create_subscription(String, "/apex_ompl/outcome", lambda m: self.outcomes.append(m.data), 10)
         self.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: self.diagnostics.extend(m.status), 10)
         self.node.create_subscription(MarkerArray, "/apex_ompl/markers", self._draw, kept)
-        for name in controllers:
-            self.node.create_subscription(JointTrajectory, f"/{name}/joint_trajectory", self._followed(name), 10)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.closed = False
@@ -83,6 +81,22 @@ class Client:
     def _spin(self) -> None:
         while not self.closed:
             self.executor.spin_once(timeout_sec=0.05)
+
+    def trajectories_of(self, controllers: Sequence[str]) -> None:
+        """Take the trajectories of controllers from now on."""
+        for name in controllers:
+            topic = f"/{name}/joint_trajectory"
+            self.node.create_subscription(JointTrajectory, topic, self._followed(name), 10)
+            self.wait(lambda topic=topic: self.node.count_publishers(topic))
+        time.sleep(0.3)
+
+    @contextmanager
+    def running(self) -> Iterator[Self]:
+        """Close the client after the block."""
+        try:
+            yield self
+        finally:
+            self.close()
 
     def close(self) -> None:
         """End the client."""

@@ -5,7 +5,7 @@ Between points the polynomial of fifth degree is followed; after the last one th
 is that from the state at the start. Joint states are published 200 times a second, and each is written to a file; the
 last joint has no velocity there (NaN), as where a robot has no such interface.
 
-Usage: python -m benchmarks.physics.stand_in_controller FILE NAME JOINT=POSITION ...
+Usage: python -m benchmarks.physics.stand_in_controller FILE NAME JOINT=POSITION ... [--ros-args ...]
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+import rclpy.utilities
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
@@ -60,7 +61,7 @@ class Controller:
 
 def main() -> None:
     """Follow trajectories until the process is killed."""
-    path, name, *given = sys.argv[1:]
+    path, name, *given = rclpy.utilities.remove_ros_args(sys.argv)[1:]
     pairs = [one.split("=") for one in given]
     controller = Controller([joint for joint, _ in pairs], np.array([float(value) for _, value in pairs]))
     rclpy.init()
