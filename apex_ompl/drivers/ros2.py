@@ -157,12 +157,12 @@ class Ros2Driver:
         """
         with self._arrived:
             kept = [*self._history]
-        stamp = self._zero + at * NANOSECONDS
+        stamp = self._zero + round(at * NANOSECONDS)
         k = bisect_right(kept, stamp, key=lambda one: one[0])
         if k in (0, len(kept)):
             return kept[min(k, len(kept) - 1)][1]
         (before, first), (after, second) = kept[k - 1 : k + 1]
-        return first + (stamp - before) / (after - before) * (second - first)
+        return np.asarray(first + (stamp - before) / (after - before) * (second - first))
 
     def commanded(self, at: float) -> Array:
         """Return the commanded positions, velocities and accelerations at a time [s], shape (3, dof).

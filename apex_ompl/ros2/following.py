@@ -229,16 +229,16 @@ class Follower:
             self._send(loop, command)
 
     def _measured(self, now: float) -> Array:
-        """Return the positions at a time that has just come [s], shape (dof,): those commanded, off by as much as at the last measurement.
+        """Return the positions at a time that has just come [s], shape (dof,); NaN where the robot is silent.
 
-        They are NaN where the robot is silent.
+        They are those commanded, off by as much as at the last measurement.
         """
         driver = self.driver
         try:
             state = driver.state()
         except DriverError:
             return np.full(len(driver.names), np.nan)
-        return driver.commanded(now)[0] + state.positions - driver.commanded(state.stamp)[0]
+        return np.asarray(driver.commanded(now)[0] + state.positions - driver.commanded(state.stamp)[0])
 
     def _send(self, loop: Loop, command: Command) -> None:
         """Send a command; where it is too late the loop follows the one before."""

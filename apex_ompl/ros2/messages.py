@@ -187,7 +187,7 @@ def cloud_points(cloud: Any) -> Array:
         return np.zeros((0, 3))
     data = np.frombuffer(cloud.data, np.uint8, cloud.height * cloud.row_step).reshape(cloud.height, cloud.row_step)
     rows = np.ascontiguousarray(data[:, : cloud.width * cloud.point_step]).view(kind).ravel()
-    found = np.stack([rows[name].astype(float) for name in "xyz"], axis=1)
+    found: Array = np.stack([rows[name].astype(float) for name in "xyz"], axis=1)
     return found[np.isfinite(found).all(axis=1)]
 
 
@@ -198,7 +198,8 @@ def thinned(points: Array, cell: float) -> Array:
         points: Shape (N, 3) [m].
         cell: Edge of a cell [m].
     """
-    return (np.unique(np.floor(points / cell).astype(np.int64), axis=0) + 0.5) * cell
+    cells = np.unique(np.floor(points / cell).astype(np.int64), axis=0)
+    return np.asarray((cells + 0.5) * cell, float)
 
 
 def moved(points: Array, pose: Array) -> Array:

@@ -14,7 +14,6 @@ from apex_ompl.drivers.ros2 import Ros2Driver
 from apex_ompl.errors import ApexError, DriverError, ParameterError
 from apex_ompl.goals.pose_goal import PoseGoal
 from apex_ompl.planning.planner import MotionPlanner
-from apex_ompl.planning.query import Target
 from apex_ompl.ros2.following import Ended, Follower
 from apex_ompl.ros2.frames import Frames
 from apex_ompl.ros2.library import ros2
@@ -37,6 +36,8 @@ GREY, RED, BLUE, GREEN = (0.6, 0.6, 0.6, 0.8), (0.9, 0.2, 0.1, 0.8), (0.1, 0.4, 
 """Colors of obstacles that stand, observed obstacles, paths, and goals."""
 LEVELS = {"failed": 1, "refused": 1, "aborted": 2}
 """Levels of diagnostics by how the last goal ended: 1 warns, 2 is an error."""
+Wanted = dict[str, float] | list[PoseTarget]
+"""A goal: a state by joint names, or poses."""
 
 
 class ApexNode:
@@ -85,6 +86,7 @@ class ApexNode:
         targets = [PoseTarget(frame=name, position=origin) for name in self._goal_frames]
         self._tools = PoseGoal(robot, targets, held, robot.home)  # which tells where they are
         self._publish, self._timers, self._doing, self._last = self._publishers(), list[Any](), "starting", Ended("")
+        self._goal_points = np.zeros((0, 3))
         self._subscribe([*tracked])
         self._executor = ros.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(node)
@@ -197,7 +199,7 @@ class ApexNode:
         self._tell(f"waiting for a goal; the last one: {ended.text}")
         self._diagnose()
 
-    def _target(self, goal: Goal) -> Target:
+    def _target(self, goal: Goal) -> Wanted:
         """Return a goal as the planner takes it.
 
         Raises:
@@ -232,7 +234,8 @@ class ApexNode:
         values = {
             "last goal": self._last.text, "obstacles": len(self._planner.world.obstacles),
             "observed obstacles": len(self._scene.observed), "points": len(self._scene.cloud),
-            "refused messages": self._scene.refused, "late commands": follower.late, "age of the state [s]": f"{age:.3f}",
+            "refused messages": self._scene.refused, "late commands": follower.late,
+            "age of the state [s]": f"{age:.3f}",
         }  # fmt: skip
         level = 2 if silent else LEVELS.get(self._last.outcome, 0)
         status = ros.DiagnosticStatus(
@@ -243,13 +246,12 @@ class ApexNode:
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publish["diagnostics"].publish(message)
 
-    def _draw(self, target: Target | None) -> None:
+    def _draw(self, target: Wanted | None) -> None:
         """Publish the obstacles, the path of the hands and the goal as markers."""
         scene, settings = self._scene, self._parameters.now
         drawing = Drawing(self._ros, settings.world_frame, self._node.get_clock().now().to_msg())
-        seen = {name for name in scene.observed}
         for name, obstacle in scene.planner.world.obstacles.items():
-            if name != CLOUD and name not in seen:
+            if name != CLOUD and name not in scene.observed:
                 drawing.add_obstacle("world", obstacle, GREY)
         for _, obstacle in scene.observed.values():
             drawing.add_obstacle("observed", obstacle, RED)
@@ -259,8 +261,9 @@ class ApexNode:
         if motion is not None:
             for path in self._paths(motion):
                 drawing.add_line("path", path, 0.005, BLUE)
-        self._goal_points = self._points_of(target) if target is not None else getattr(self, "_goal_points", None)
-        if self._goal_points is not None:
+        if target is not None:
+            self._goal_points = self._points_of(target)
+        if len(self._goal_points):
             drawing.add_balls("goal", self._goal_points, 0.04, GREEN)
         self._publish["markers"].publish(drawing.message)
 
@@ -272,8 +275,8 @@ class ApexNode:
         """Return where the goal frames are at a state, shape (frames, 3) [m]."""
         return np.array([pose[:3, 3] for pose in self._tools.placements(q)])
 
-    def _points_of(self, target: Target) -> Array:
+    def _points_of(self, target: Wanted) -> Array:
         """Return where the goal frames are to be, shape (N, 3) [m]."""
         if isinstance(target, dict):
             return self._places(np.array([target[name] for name in self._planner.robot.joint_names]))
-        return np.array([one.position for one in target if isinstance(one, PoseTarget)])
+        return np.array([one.position for one in target])

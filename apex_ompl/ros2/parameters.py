@@ -203,6 +203,5 @@ class Parameters:
 
 
 def _settings(values: Mapping[str, Any]) -> NodeSettings:
-    return NodeSettings(
-        **{k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in values.items()}
-    )
+    given: dict[str, Any] = {name: tuple(v) if isinstance(v, (list, tuple)) else v for name, v in values.items()}
+    return NodeSettings(**given)

@@ -171,7 +171,9 @@ class Scene:
         """
         self.remove_observed()
         self.observed = {
-            name: (stamp, one) for name, (stamp, one) in self.observed.items() if stamp >= since or name in self._tracked
+            name: (stamp, one)
+            for name, (stamp, one) in self.observed.items()
+            if stamp >= since or name in self._tracked
         }
         for name, (_, obstacle) in self.observed.items():
             self._try(self.planner.world.add, obstacle)

@@ -58,7 +58,9 @@ class Client:
         sensor, deep = qos_profile_sensor_data, QoSProfile(depth=10)
         self.publishers = {
             name: self.node.create_publisher(
-                TYPES[name], f"/apex_ompl/{name}", sensor if name in ("obstacles", "points") or "object" in name else deep
+                TYPES[name],
+                f"/apex_ompl/{name}",
+                sensor if name in ("obstacles", "points") or "object" in name else deep,
             )
             for name in topics
         }
@@ -146,10 +148,10 @@ def cloud_of(points: np.ndarray, frame: str = "world") -> PointCloud2:
 
 
 def marker_of(
-    kind: int, size: Sequence[float], position: Sequence[float], number: int = 0, space: str = "", frame: str = "world"
+    kind: int, size: Sequence[float], position: Sequence[float], *, space: str = "", frame: str = "world"
 ) -> Marker:
     """Return a marker that is turned by nothing."""
-    marker = Marker(type=kind, id=number, ns=space)
+    marker = Marker(type=kind, ns=space)
     marker.header.frame_id = frame
     for message, values in ((marker.scale, size), (marker.pose.position, position)):
         message.x, message.y, message.z = map(float, values)

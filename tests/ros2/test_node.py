@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -50,7 +51,15 @@ def stand_ins(robot: Robot, tmp_path_factory: Any) -> Iterator[Any]:
 def node(robot: Robot, stand_ins: Any) -> Iterator[ApexNode]:
     home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
     problem = Problem(name="ball", robot=robot.name, scene=(BALL,), start=home, goal={"joints": home})
-    given = [*stand_ins.parameters(), "-p", "speed:=1.0", "-p", "tracked:=[ball]", "-p", "frames:=['camera=0 0 1 0 0 0 1']"]
+    given = [
+        *stand_ins.parameters(),
+        "-p",
+        "speed:=1.0",
+        "-p",
+        "tracked:=[ball]",
+        "-p",
+        "frames:=['camera=0 0 1 0 0 0 1']",
+    ]
     found = ApexNode(MotionPlanner(robot), problem, given)
     thread = threading.Thread(target=found.run)
     thread.start()
@@ -170,7 +179,7 @@ def test_faulty_goals_are_refused_in_a_sentence(robot: Robot, client: Any) -> No
     ):
         said = client.go(topic, message)
         assert said.startswith("refused: ") and "\n" not in said
-        assert pytest.importorskip("re").search(why, said), said
+        assert re.search(why, said), said
     far = JointState(name=["r_left_joint1"], position=[9.0])
     assert client.go("goal/joints", far).startswith("failed: invalid goal, ")
     assert client.wait(lambda: [one for one in client.diagnostics if one.level == bytes([1])])
