@@ -45,13 +45,14 @@ class Client:
         outcomes: How goals ended, so far.
         diagnostics: The statuses that were told.
         markers: The last markers.
+        clouds: Number of clouds that came, where they are counted.
         trajectories: Times of arrival on the monotonic clock [s], and trajectories, by controller.
     """
 
     def __init__(self, topics: Sequence[str] = (*TYPES,)) -> None:
         """Start publishers of some topics."""
         self.outcomes, self.diagnostics, self.markers = list[str](), list[Any](), list[Any]()
-        self.trajectories: list[tuple[float, str, Any]] = []
+        self.trajectories, self.clouds = list[tuple[float, str, Any]](), 0
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
         self.node = rclpy.create_node("client", context=self.context)
@@ -90,6 +91,15 @@ class Client:
             topic = f"/{name}/joint_trajectory"
             self.node.create_subscription(JointTrajectory, topic, self._followed(name), 10)
             self.wait(lambda topic=topic: self.node.count_publishers(topic))
+        time.sleep(0.3)
+
+    def count_clouds(self) -> None:
+        """Count the clouds that come through the middleware from now on."""
+
+        def count(_: Any) -> None:
+            self.clouds += 1
+
+        self.node.create_subscription(PointCloud2, "/apex_ompl/points", count, qos_profile_sensor_data)
         time.sleep(0.3)
 
     @contextmanager
