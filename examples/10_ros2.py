@@ -5,9 +5,8 @@ Usage: python examples/10_ros2.py    (needs the extra "ros2"; beside controllers
 
 import time
 
-from apex_ompl import Loop, LoopSettings, Obstacle, load_problem, load_robot
+from apex_ompl import ApexError, Loop, LoopSettings, Obstacle, load_problem, load_robot
 from apex_ompl.drivers import Ros2Driver
-from apex_ompl.errors import ParameterError
 
 PREFIX = "r_"  # of joints in ROS
 
@@ -41,7 +40,7 @@ with Loop(problem, settings=LoopSettings(error=0.01, fastest=0.3)) as loop:
         if command is not None and not (command.rests and driver.end <= command.at):
             try:
                 driver.send(command.motion, command.at)
-            except ParameterError:  # its time is over
+            except ApexError:  # its time is over
                 loop.missed()
         time.sleep(0.001)
     print(loop.outcome, loop.reason)

@@ -24,6 +24,7 @@ from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.controllers import Controllers
 from apex_ompl.drivers.driver import DriverState
 from apex_ompl.drivers.library import rclpy
+from apex_ompl.drivers.outlets import ActionOutlet, TopicOutlet
 from apex_ompl.errors import DriverError, ParameterError
 from apex_ompl.robot.model import Robot
 from apex_ompl.timing.files import NANOSECONDS
@@ -36,7 +37,6 @@ LEAD = 0.03  # after which a stop starts [s]
 SILENCE = 0.5  # age of the state after which the robot counts as silent [s]
 STARTED = 10.0  # time to wait for controllers and the first state [s]
 SPUN = 0.05  # longest time between two looks at whether to end [s]
-DEPTH = 10  # messages that wait
 KEPT = 1000  # measured positions that are kept
 
 
@@ -55,7 +55,7 @@ class Ros2Driver:
     def __init__(
         self, robot: Robot, controllers: Mapping[str, Sequence[str]] | str, *, renamed: Mapping[str, str] | None = None,
         states: str = "/joint_states", node: Any = "apex_ompl", lead: float = LEAD, silence: float = SILENCE,
-        tolerance: float = START_TOLERANCE, started: float = STARTED,
+        tolerance: float = START_TOLERANCE, started: float = STARTED, action: bool = False,
     ) -> None:  # fmt: skip
         """Wait for the controllers and the first joint states, in which the robot is taken to rest.
 
@@ -71,9 +71,11 @@ class Ros2Driver:
             silence: Age of the state after which :meth:`state` says that the robot is silent [s].
             tolerance: Largest distance of the start of a motion from the commanded position [rad].
             started: Time to wait for controllers and states [s].
+            action: Whether motions go as goals of the actions ``/NAME/follow_joint_trajectory``, of which each replaces
+                the one before, in place of the topics; what they answer is then an error of :meth:`state`.
 
         Raises:
-            MissingFileError: The extra ``ros2`` is not installed.
+            MissingFileError: The extra ``ros2`` is not installed, or ``control_msgs`` for actions.
             ParameterError: A joint has no controller, or more than one, or is unknown, or a number is not positive.
             DriverError: A controller or the joint states did not appear, or the robot is outside its limits.
         """
@@ -85,6 +87,7 @@ class Ros2Driver:
         self._lead, self._silence, self._closed = lead, silence, False
         self._lock, self._arrived = threading.Lock(), threading.Condition()
         self._measured: tuple[int, Array, Array] | None = None
+        self._answer = ""
         self._history = deque[tuple[int, Array]](maxlen=KEPT)
         self._seen: dict[str, tuple[int, float, float]] = {}
         atexit.register(self.close)  # a thread that still spins then would crash the process
@@ -92,10 +95,13 @@ class Ros2Driver:
             self._own = _OwnNode(ros, node) if isinstance(node, str) else None
             self._node = node if self._own is None else self._own.node
             self._zero = self._node.get_clock().now().nanoseconds
-            self._publishers = {
-                topic: self._node.create_publisher(ros.JointTrajectory, topic, DEPTH)
-                for topic in self.controllers.topics
-            }
+            self._outlets: dict[str, TopicOutlet | ActionOutlet] = {}
+            for name in self.controllers.joints:
+                self._outlets[name] = (
+                    ActionOutlet(self._node, name, self._refused)
+                    if action
+                    else TopicOutlet(self._node, ros.JointTrajectory, name)
+                )
             self._subscription = self._node.create_subscription(
                 ros.JointState, states, self._take, ros.qos_profile_sensor_data
             )
@@ -129,9 +135,11 @@ class Ros2Driver:
         """Return the last measured state.
 
         Raises:
-            DriverError: It is older than ``silence``.
+            DriverError: It is older than ``silence``, or a controller did not take or follow the last motion.
         """
         self._check_open()
+        if self._answer:
+            raise DriverError(self._answer)
         with self._arrived:
             assert self._measured is not None
             stamp, positions, velocities = self._measured
@@ -148,6 +156,7 @@ class Ros2Driver:
             now = self.time
             self._commands.send(motion, at, now)
             self._commands.forget(now - self._silence)
+            self._answer = ""
             self._publish(motion, at)
 
     def positions(self, at: float) -> Array:
@@ -204,8 +213,8 @@ class Ros2Driver:
             own.close()
         elif hasattr(self, "_subscription"):
             self._node.destroy_subscription(self._subscription)
-            for publisher in self._publishers.values():
-                self._node.destroy_publisher(publisher)
+            for outlet in self._outlets.values():
+                outlet.close()
 
     def _check_open(self) -> None:
         if self._closed:
@@ -224,10 +233,10 @@ class Ros2Driver:
         if measured is None:
             missing = [name for name in self.controllers.ros_names if name not in self._seen]
             raise DriverError(f"no state of {', '.join(missing)} came on {states} in {started:g} s")
-        for topic, publisher in self._publishers.items():
+        for outlet in self._outlets.values():
             with self._arrived:
-                if not self._arrived.wait_for(partial(_is_heard, publisher), started):
-                    raise DriverError(f"no controller listens to {topic}")
+                if not self._arrived.wait_for(partial(getattr, outlet, "heard"), started):
+                    raise DriverError(f"no controller listens to {outlet.place}")
         return measured[1]
 
     def _take(self, message: Any) -> None:
@@ -261,7 +270,11 @@ class Ros2Driver:
                 point = self._point(positions=q, velocities=v, accelerations=a)
                 point.time_from_start.sec, point.time_from_start.nanosec = divmod(tick, NANOSECONDS)
                 message.points.append(point)
-            self._publishers[part.topic].publish(message)
+            self._outlets[part.controller].send(message)
+
+    def _refused(self, why: str) -> None:
+        """Keep why a controller did not take or follow the last motion."""
+        self._answer = why
 
 
 class _OwnNode:
@@ -290,7 +303,3 @@ class _OwnNode:
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()
-
-
-def _is_heard(publisher: Any) -> bool:
-    return bool(publisher.get_subscription_count() > 0)

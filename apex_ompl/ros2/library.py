@@ -17,7 +17,8 @@ NEEDED = {
     "geometry_msgs.msg": ("Point", "PoseArray", "PoseStamped"),
     "rcl_interfaces.msg": ("FloatingPointRange", "IntegerRange", "ParameterDescriptor", "SetParametersResult"),
     "sensor_msgs.msg": ("JointState", "PointCloud2"), "std_msgs.msg": ("ColorRGBA", "String"),
-    "trajectory_msgs.msg": ("JointTrajectory",), "visualization_msgs.msg": ("Marker", "MarkerArray"),
+    "trajectory_msgs.msg": ("JointTrajectory", "JointTrajectoryPoint"),
+    "visualization_msgs.msg": ("Marker", "MarkerArray"),
 }  # fmt: skip
 OPTIONAL = {"tf2_msgs.msg": ("TFMessage",), "moveit_msgs.srv": ("GetMotionPlan",)}
 """Packages without wheels: a ROS 2 of the system has them."""

@@ -18,6 +18,7 @@ from apex_ompl.ros2.following import Ended, Follower
 from apex_ompl.ros2.frames import Frames
 from apex_ompl.ros2.library import ros2
 from apex_ompl.ros2.messages import Drawing, joint_goal, pose_target
+from apex_ompl.ros2.move_group import MotionPlanService
 from apex_ompl.ros2.parameters import Parameters, joints_by_controller
 from apex_ompl.ros2.scene import CLOUD, Goal, Inbox, Scene
 from apex_ompl.scene.problem import PoseTarget, Problem
@@ -95,11 +96,16 @@ class ApexNode:
         self._wait_for_time()
         renamed = settings.ros_names()
         self._driver = Ros2Driver(
-            robot, controllers, renamed=renamed, node=node, started=STARTED, tolerance=min(settings.tolerance, 1e-3)
+            robot, controllers, renamed=renamed, node=node, started=STARTED, action=settings.action
         )
         self._joints = {renamed.get(name, name): name for name in robot.joint_names}
         self._follower = Follower(self._driver, self._scene, self._inbox, lambda: self._parameters.now, self._tell)
         self._warm_up()
+        if ros.GetMotionPlan is not None:
+            MotionPlanService(
+                ros, node, self._executor, planner, settings=lambda: self._parameters.now,
+                state=lambda: self._driver.commanded(self._driver.end)[0], renamed=renamed,
+            )  # fmt: skip
         self._timers.append(node.create_timer(TOLD, self._diagnose))
 
     def _publishers(self) -> dict[str, Any]:

@@ -3,7 +3,8 @@
 A trajectory starts at the stamp of its header, at once where that is 0, and replaces the one before at that time.
 Between points the polynomial of fifth degree is followed; after the last one the robot stays. Before the first point it
 is that from the state at the start. Joint states are published 200 times a second, and each is written to a file; the
-last joint has no velocity there (NaN), as where a robot has no such interface.
+last joint has no velocity there (NaN), as where a robot has no such interface. Where ``control_msgs`` is installed, the
+controller offers its action, too: a new goal aborts the one before, and a goal of other joints is rejected.
 
 Usage: python -m benchmarks.physics.stand_in_controller FILE NAME JOINT=POSITION ... [--ros-args ...]
 """
@@ -20,6 +21,9 @@ from typing import Any
 import numpy as np
 import rclpy
 import rclpy.utilities
+from rclpy.action import ActionServer, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
@@ -59,6 +63,34 @@ class Controller:
         return np.stack([evaluated(c, h, share, order)[0, 0] for order in range(3)])
 
 
+def offer_action(node: Any, name: str, controller: Controller) -> None:
+    """Offer ``/NAME/follow_joint_trajectory`` where ``control_msgs`` is installed."""
+    try:
+        from control_msgs.action import FollowJointTrajectory
+    except ImportError:
+        return
+    goals = list[Any]()
+
+    def accept(goal: Any) -> Any:
+        known = list(goal.trajectory.joint_names) == controller.names
+        return GoalResponse.ACCEPT if known else GoalResponse.REJECT
+
+    def follow(handle: Any) -> Any:
+        goals.append(handle)
+        clock, trajectory, result = node.get_clock(), handle.request.trajectory, FollowJointTrajectory.Result()
+        controller.take(trajectory, clock.now().nanoseconds)
+        last, stamp = trajectory.points[-1].time_from_start, trajectory.header.stamp
+        end = (stamp.sec + last.sec) * NANOSECONDS + stamp.nanosec + last.nanosec
+        while clock.now().nanoseconds < end and goals[-1] is handle:
+            time.sleep(0.005)
+        handle.succeed() if goals[-1] is handle else handle.abort()
+        return result
+
+    group = ReentrantCallbackGroup()
+    place = f"/{name}/follow_joint_trajectory"
+    ActionServer(node, FollowJointTrajectory, place, follow, goal_callback=accept, callback_group=group)
+
+
 def main() -> None:
     """Follow trajectories until the process is killed."""
     path, name, *given = rclpy.utilities.remove_ros_args(sys.argv)[1:]
@@ -71,7 +103,10 @@ def main() -> None:
         JointTrajectory, f"/{name}/joint_trajectory", lambda m: controller.take(m, clock.now().nanoseconds), 10
     )
     states = node.create_publisher(JointState, "/joint_states", qos_profile_sensor_data)
-    threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()
+    offer_action(node, name, controller)
+    executor = MultiThreadedExecutor(4)
+    executor.add_node(node)
+    threading.Thread(target=executor.spin, daemon=True).start()
     with open(path, "w") as file:  # noqa: PTH123
         while rclpy.ok():
             now = clock.now()
