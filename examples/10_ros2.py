@@ -31,12 +31,12 @@ controllers = {"left": left, "right": [name for name in robot.joint_names if nam
 driver = Ros2Driver(robot, controllers, renamed={name: PREFIX + name for name in robot.joint_names}, started=60.0)
 start = dict(zip(robot.joint_names, driver.state().positions.tolist(), strict=True))
 problem = problem.model_copy(update={"start": start})  # the robot starts where it is
-with Loop(problem, settings=LoopSettings(error=0.01, fastest=0.3)) as loop:
+with Loop(problem, settings=LoopSettings(error=0.01, fastest=0.3, period=0.025)) as loop:
     while loop.outcome is None:
-        now = driver.time
+        now, state = driver.time, driver.state()
         if (seen := camera.look(now)) is not None:
             loop.observe(now, seen)
-        command = loop.step(now, driver.state().positions)
+        command = loop.step(now, state.positions + (now - state.stamp) * state.velocities)
         if command is not None and not (command.rests and driver.end <= command.at):
             try:
                 driver.send(command.motion, command.at)

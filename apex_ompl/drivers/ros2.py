@@ -34,6 +34,7 @@ from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_positive
 
 LEAD = 0.03  # after which a stop starts [s]
+TRANSIT = 0.005  # in which a message arrives [s]
 SILENCE = 0.5  # age of the state after which the robot counts as silent [s]
 STARTED = 10.0  # time to wait for controllers and the first state [s]
 SPUN = 0.05  # longest time between two looks at whether to end [s]
@@ -55,7 +56,7 @@ class Ros2Driver:
     def __init__(
         self, robot: Robot, controllers: Mapping[str, Sequence[str]] | str, *, renamed: Mapping[str, str] | None = None,
         states: str = "/joint_states", node: Any = "apex_ompl", lead: float = LEAD, silence: float = SILENCE,
-        tolerance: float = START_TOLERANCE, started: float = STARTED, action: bool = False,
+        tolerance: float = START_TOLERANCE, started: float = STARTED, transit: float = TRANSIT, action: bool = False,
     ) -> None:  # fmt: skip
         """Wait for the controllers and the first joint states, in which the robot is taken to rest.
 
@@ -71,6 +72,8 @@ class Ros2Driver:
             silence: Age of the state after which :meth:`state` says that the robot is silent [s].
             tolerance: Largest distance of the start of a motion from the commanded position [rad].
             started: Time to wait for controllers and states [s].
+            transit: Time in which a message arrives; a motion that starts earlier is refused, since the controller
+                would jump to it [s].
             action: Whether motions go as goals of the actions ``/NAME/follow_joint_trajectory``, of which each replaces
                 the one before, in place of the topics; what they answer is then an error of :meth:`state`.
 
@@ -80,11 +83,11 @@ class Ros2Driver:
             DriverError: A controller or the joint states did not appear, or the robot is outside its limits.
         """
         ros = rclpy()
-        for name, value in {"lead": lead, "silence": silence, "started": started}.items():
+        for name, value in {"lead": lead, "silence": silence, "started": started, "transit": transit}.items():
             check_positive(value, name)
         self.names, self.limits, self._robot = robot.joint_names, robot.limits, robot
         self.controllers = Controllers(self.names, controllers, renamed)
-        self._lead, self._silence, self._closed = lead, silence, False
+        self._lead, self._silence, self._transit, self._closed = lead, silence, transit, False
         self._lock, self._arrived = threading.Lock(), threading.Condition()
         self._measured: tuple[int, Array, Array] | None = None
         self._answer = ""
@@ -154,7 +157,7 @@ class Ros2Driver:
         self._check_open()
         with self._lock:
             now = self.time
-            self._commands.send(motion, at, now)
+            self._commands.send(motion, at, now + self._transit)
             self._commands.forget(now - self._silence)
             self._answer = ""
             self._publish(motion, at)
@@ -242,6 +245,7 @@ class Ros2Driver:
     def _take(self, message: Any) -> None:
         """Take joint states, of all joints or of some; without a stamp they are of now.
 
+        Of joints that were measured later than others the positions at the time of these count, by the velocities.
         Velocities that are missing or NaN, as those of a broadcaster without that interface, are taken to be 0.
         """
         stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
@@ -253,11 +257,12 @@ class Ros2Driver:
         rows = [self._seen.get(name) for name in self.controllers.ros_names]
         with self._arrived:
             if all(row is not None for row in rows):
-                found = np.array([row[1:] for row in rows if row is not None])
-                stamp = min(row[0] for row in rows if row is not None)
-                self._measured = stamp, found[:, 0], found[:, 1]
+                stamps, positions, velocities = map(np.array, zip(*(row for row in rows if row), strict=True))
+                stamp = int(stamps.min())
+                positions -= velocities * (stamps - stamp) / NANOSECONDS
+                self._measured = stamp, positions, velocities
                 if not self._history or stamp > self._history[-1][0]:
-                    self._history.append((stamp, found[:, 0]))
+                    self._history.append((stamp, positions))
             self._arrived.notify_all()
 
     def _publish(self, motion: Trajectory, at: float) -> None:

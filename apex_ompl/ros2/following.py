@@ -160,7 +160,7 @@ class Follower:
                     self.tell(f"stopping: {fault}")
                     return None
             time.sleep(LOOK)
-        return Ended("reached")
+        return self._fault() or Ended("reached")
 
     def _interruption(self) -> Ended | None:
         """Return how a motion ends before its end, where it is to."""

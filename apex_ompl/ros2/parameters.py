@@ -17,6 +17,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_name, check_number
 
 CLOSED_LOOP = ("auto", "always", "never")
+BUDGET = 0.05  # of a replan, or the nearest multiple of the period [s]
 POSE_NUMBERS = 7  # position and quaternion xyzw
 
 
@@ -43,6 +44,7 @@ class NodeSettings:
         fastest: Largest speed of obstacles [m/s].
         timeout: Time after which the closed loop gives up [s].
         stuck: Time of rest after which the closed loop gives up [s].
+        period: Time between two commands of the closed loop [s].
         speed: Share of the velocity limits.
         planning_time: Time for a plan [s].
         lead: Time between a plan and the start of its motion [s].
@@ -69,6 +71,7 @@ class NodeSettings:
     fastest: float = _known(0.5, "largest speed of obstacles [m/s]", 0.0, 5.0)
     timeout: float = _known(60.0, "time after which the closed loop gives up [s]", 0.1, 600.0)
     stuck: float = _known(10.0, "time of rest after which the closed loop gives up [s]", 0.1, 600.0)
+    period: float = _known(0.025, "time between two commands of the closed loop [s]", 0.005, 0.1)
     speed: float = _known(0.5, "share of the velocity limits", 0.001, 1.0)
     planning_time: float = _known(5.0, "time for a plan [s]", 0.01, 600.0)
     lead: float = _known(0.05, "time between a plan and the start of its motion [s]", 0.005, 10.0)
@@ -97,7 +100,10 @@ class NodeSettings:
     @property
     def loop(self) -> LoopSettings:
         """Settings of the closed loop."""
-        return LoopSettings(error=self.error, fastest=self.fastest, timeout=self.timeout, stuck=self.stuck)
+        return LoopSettings(
+            error=self.error, fastest=self.fastest, timeout=self.timeout, stuck=self.stuck, period=self.period,
+            budget=self.period * max(1, round(BUDGET / self.period)),
+        )  # fmt: skip
 
     def poses(self) -> dict[str, Array]:
         """Return the poses of frames in the world, shape (4, 4) [m].

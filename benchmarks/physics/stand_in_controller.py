@@ -23,7 +23,7 @@ import rclpy
 import rclpy.utilities
 from rclpy.action import ActionServer, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory
@@ -63,12 +63,12 @@ class Controller:
         return np.stack([evaluated(c, h, share, order)[0, 0] for order in range(3)])
 
 
-def offer_action(node: Any, name: str, controller: Controller) -> None:
-    """Offer ``/NAME/follow_joint_trajectory`` where ``control_msgs`` is installed."""
+def offer_action(node: Any, name: str, controller: Controller) -> bool:
+    """Offer ``/NAME/follow_joint_trajectory`` where ``control_msgs`` is installed, and return whether it is."""
     try:
         from control_msgs.action import FollowJointTrajectory
     except ImportError:
-        return
+        return False
     goals = list[Any]()
 
     def accept(goal: Any) -> Any:
@@ -89,6 +89,7 @@ def offer_action(node: Any, name: str, controller: Controller) -> None:
     group = ReentrantCallbackGroup()
     place = f"/{name}/follow_joint_trajectory"
     ActionServer(node, FollowJointTrajectory, place, follow, goal_callback=accept, callback_group=group)
+    return True
 
 
 def main() -> None:
@@ -103,8 +104,7 @@ def main() -> None:
         JointTrajectory, f"/{name}/joint_trajectory", lambda m: controller.take(m, clock.now().nanoseconds), 10
     )
     states = node.create_publisher(JointState, "/joint_states", qos_profile_sensor_data)
-    offer_action(node, name, controller)
-    executor = MultiThreadedExecutor(4)
+    executor = MultiThreadedExecutor(4) if offer_action(node, name, controller) else SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
     with open(path, "w") as file:  # noqa: PTH123

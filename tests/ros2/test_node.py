@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -295,6 +296,22 @@ def test_the_closed_loop_waits_for_what_moves(robot: Robot, stand_ins: Any, clie
         assert checker.is_free(states[k])
     assert {"observed"} <= {marker.ns for marker in client.markers}
     time.sleep(3.2)  # what was observed counts as moving for 3 s
+
+
+def test_a_robot_that_falls_silent_ends_the_motion(robot: Robot, stand_ins: Any, client: Any) -> None:
+    assert client.go("goal/joints", joints(robot, swung(robot, -1.0))) == "reached"
+    count = len(client.outcomes)
+    client.publishers["goal/joints"].publish(joints(robot, swung(robot, 1.0)))
+    time.sleep(0.3)  # of a motion of more than a second
+    for process in stand_ins.processes:
+        process.send_signal(signal.SIGSTOP)
+    try:
+        (said,) = client.wait(lambda: client.outcomes[count:])
+    finally:
+        for process in stand_ins.processes:
+            process.send_signal(signal.SIGCONT)
+    assert said.startswith("aborted: there were no joint states for")
+    client.wait(lambda: [one for one in client.diagnostics if one.level == bytes([2])])
 
 
 def test_parameters_are_checked_when_they_are_set(client: Any, robot: Robot) -> None:

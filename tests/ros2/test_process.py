@@ -138,7 +138,7 @@ def test_simulated_time_counts_where_it_is_asked_for(robot: Robot, tmp_path: Pat
 
         def tick() -> None:
             began = time.monotonic()
-            while not over.wait(0.002):
+            while not over.wait(0.005):
                 message = Clock()
                 ticks = int(5e8 * (time.monotonic() - began)) + 10**9
                 message.clock.sec, message.clock.nanosec = divmod(ticks, 10**9)
@@ -147,7 +147,7 @@ def test_simulated_time_counts_where_it_is_asked_for(robot: Robot, tmp_path: Pat
         thread = threading.Thread(target=tick)
         thread.start()
         try:
-            with node_of(stand_ins, *simulated, "-p", "speed:=0.5") as (_, client):
+            with node_of(stand_ins, *simulated, "-p", "speed:=0.5", "-p", "lead:=0.2") as (_, client):
                 client.trajectories_of(["left"])
                 began = time.monotonic()
                 goal = swing(robot, client, 0.5)
