@@ -25,7 +25,7 @@ from apex_ompl.robot.config import resolve
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields, pose_matrix
 from apex_ompl.scene.constraints import Constraint, FixedOrientation, ToolRegion, Upright
-from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.scene.problem import Goal, PoseTarget, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.schema import StrictModel, read_yaml, validate
 from apex_ompl.util.validation import is_integer, is_number
@@ -360,7 +360,36 @@ def convert(
         FileFormatError: Content is faulty or not supported; the message names it.
         UnknownNameError: The joint map names an unknown joint.
     """
-    scene_data, request_data = read_yaml(scene, "scene file"), read_yaml(request, "request file")
+    messages = read_yaml(scene, "scene file"), read_yaml(request, "request file")
+    return converted(*messages, robot, joint_map, frame_map, scene=scene, request=request)
+
+
+def converted(
+    scene_data: Mapping[str, Any],
+    request_data: Mapping[str, Any],
+    robot: Robot,
+    joint_map: Mapping[str, str] | None = None,
+    frame_map: Mapping[str, str] | None = None,
+    *,
+    scene: Path = Path("scene"),
+    request: Path = Path("request"),
+) -> Conversion:
+    """Return the problem of messages as plain data (:func:`convert`).
+
+    Args:
+        scene_data: A ``moveit_msgs/PlanningScene`` or its world.
+        request_data: A ``moveit_msgs/MotionPlanRequest``.
+        robot: The robot.
+        joint_map: Joint name in the messages -> planned joint of ``robot``.
+        frame_map: Frame in the messages -> ``world`` or a link of ``robot``.
+        scene: What the scene is called in errors, and where meshes are looked for.
+        request: What the request is called in errors.
+
+    Raises:
+        MissingFileError: A mesh cannot be read.
+        FileFormatError: Content is faulty or not supported; the message names it.
+        UnknownNameError: The joint map names an unknown joint.
+    """
     notes: list[str] = []
     at_scene = _Reader(scene, robot, joint_map or {}, frame_map or {}, notes)
     at_request = _Reader(request, robot, joint_map or {}, frame_map or {}, notes)
@@ -386,7 +415,7 @@ def convert(
         if any(item.get(key.removeprefix("link_"), usual) != usual for item in at_scene.messages(scene_data, key)):
             notes.append(f"{key}: not used, the robot has its own size")
     constraints = tuple(_path_constraints(at_request, request_data, q))
-    goals = _goals(at_request, request_data, start)
+    goal = _goal(at_request, request_data, start)
     for key in HARMLESS:
         if request_data.get(key):
             notes.append(f"{key}: not used")
@@ -394,7 +423,7 @@ def convert(
     fields = {
         "name": name, "robot": robot.name, "scene": tuple(obstacles), "attached": tuple(attached),
         "allowed": tuple(allowed), "start": start,
-        "goal": Goal(joints=tuple(goals)), "constraints": constraints,
+        "goal": goal, "constraints": constraints,
     }  # fmt: skip
     problem = validate(Problem, fields, str(scene))
     return Conversion(problem, notes)
@@ -524,6 +553,16 @@ def _orientation_constraint(
 
 def _position_constraint(reader: _Reader, message: Mapping[str, Any], start: Array, where: str) -> ToolRegion:
     """Return the box that a link's origin, or the grasp point of a hand, stays in."""
+    frame, shape, pose = _region(reader, message, start, where, "box")
+    half = np.array(shape["box"]) / 2.0
+    fields = {"lower": tuple((-half).tolist()), "upper": tuple(half.tolist()), **pose_fields(pose)}
+    return reader.record(ToolRegion, {"frame": frame, **fields}, f"{where}.constraint_region")
+
+
+def _region(
+    reader: _Reader, message: Mapping[str, Any], start: Array, where: str, kind: str
+) -> tuple[str, dict[str, Any], Array]:
+    """Return the frame of a position constraint, a link or a hand, the one shape that it is in, and that one's pose."""
     link, base = reader.constrained_link(message, start, where)
     offset = reader.numbers(message.get("target_point_offset"), "xyz", (0.0, 0.0, 0.0), f"{where}.target_point_offset")
     if float(np.linalg.norm(offset)) > SAME_POINT:
@@ -533,27 +572,65 @@ def _position_constraint(reader: _Reader, message: Mapping[str, Any], start: Arr
             expected = "cannot be read, expected 0, or the grasp point of a hand"
             raise reader.fail(f"{where}.target_point_offset", offset.tolist(), expected)
         link = near[0]
-    inside_of = f"{where}.constraint_region"
+    inside_of, expected = f"{where}.constraint_region", f"cannot be read, expected one {kind}"
     region = reader.section(message, "constraint_region", where)
-    reader.refuse(region, "meshes", "a list", "cannot be read, expected one box", inside_of)
+    reader.refuse(region, "meshes", "a list", expected, inside_of)
     shapes = reader.paired(region, "primitives", "primitive_poses", inside_of)
     if len(shapes) != 1:
-        raise reader.fail(f"{inside_of}.primitives", len(shapes), "cannot be read, expected one box")
+        raise reader.fail(f"{inside_of}.primitives", len(shapes), expected)
     shape = reader.primitive(shapes[0][0], f"{inside_of}.primitives.0")
-    if "box" not in shape:
-        raise reader.fail(f"{inside_of}.primitives.0", next(iter(shape)), "cannot be read, expected one box")
-    half = np.array(shape["box"]) / 2.0
-    fields = {"lower": tuple((-half).tolist()), "upper": tuple(half.tolist()), **pose_fields(base @ shapes[0][1])}
-    return reader.record(ToolRegion, {"frame": link, **fields}, inside_of)
+    if kind not in shape:
+        raise reader.fail(f"{inside_of}.primitives.0", next(iter(shape)), expected)
+    return link, shape, base @ shapes[0][1]
 
 
-def _goals(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float]) -> list[dict[str, float]]:
+def _goal(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float]) -> Goal:
+    """Return the goal: poses of one or more links, as MoveIt makes them of poses, or joints."""
+    goals = reader.messages(data, "goal_constraints")
+    if len(goals) == 1 and goals[0].get("position_constraints") and not goals[0].get("joint_constraints"):
+        return Goal(poses=tuple(_pose_targets(reader, goals[0], start, "goal_constraints.0")))
+    return Goal(joints=tuple(_joint_goals(reader, goals, start)))
+
+
+def _pose_targets(
+    reader: _Reader, goal: Mapping[str, Any], start: Mapping[str, float], where: str
+) -> Iterator[PoseTarget]:
+    """Yield a pose for each position constraint, which is a ball; its center and its radius, as a tolerance, count.
+
+    An orientation constraint of the same link gives the orientation, with the smallest of its tolerances.
+    """
+    reader.refuse(goal, "visibility_constraints", "a list", "cannot be read, expected none", where)
+    q = np.array([start[name] for name in reader.robot.joint_names])
+    turns = {str(one.get("link_name")): one for one in reader.messages(goal, "orientation_constraints", where)}
+    for k, message in enumerate(reader.messages(goal, "position_constraints", where)):
+        at = f"{where}.position_constraints.{k}"
+        frame, shape, pose = _region(reader, message, q, at, "sphere")
+        tolerance = {"position": shape["sphere"]["radius"]}
+        fields: dict[str, Any] = {"frame": frame, "position": pose_fields(pose)["position"], "tolerance": tolerance}
+        turn = turns.pop(str(message.get("link_name")), None)
+        if turn is not None:
+            there = f"{where}.orientation_constraints of {message.get('link_name')}"
+            _, base = reader.constrained_link(turn, q, there)
+            fields["orientation"] = pose_fields(base @ reader.pose({"orientation": turn.get("orientation")}, there))[
+                "orientation"
+            ]
+            angles = [reader.number(turn.get(f"absolute_{axis}_axis_tolerance", 0.0), there) for axis in "xyz"]
+            tolerance["angle"] = min(angles)
+        yield reader.record(PoseTarget, fields, at)
+    if turns:
+        raise reader.fail(where, next(iter(turns)), "expected a position for each link with an orientation")
+
+
+def _joint_goals(
+    reader: _Reader, found: Sequence[Mapping[str, Any]], start: Mapping[str, float]
+) -> list[dict[str, float]]:
     goals = []
-    for k, goal in enumerate(reader.messages(data, "goal_constraints")):
+    for k, goal in enumerate(found):
         where = f"goal_constraints.{k}"
         for other in ("position_constraints", "orientation_constraints", "visibility_constraints"):
             if goal.get(other):
-                raise reader.fail(f"{where}.{other}", "a list", "cannot be read, expected joint_constraints only")
+                expected = "cannot be read, expected joint_constraints only, or one goal of positions"
+                raise reader.fail(f"{where}.{other}", "a list", expected)
         values = dict(start)
         reached = False
         for j, constraint in enumerate(reader.messages(goal, "joint_constraints", where)):
