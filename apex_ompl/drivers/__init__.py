@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from apex_ompl.drivers.bag import BagDriver as BagDriver
     from apex_ompl.drivers.driver import Driver as Driver
     from apex_ompl.drivers.driver import DriverState as DriverState
+    from apex_ompl.drivers.guard import Guard as Guard
     from apex_ompl.drivers.kinematic import KinematicDriver as KinematicDriver
     from apex_ompl.drivers.mujoco import MujocoDriver as MujocoDriver
     from apex_ompl.drivers.ros2 import Ros2Driver as Ros2Driver
@@ -21,6 +22,7 @@ __all__, __getattr__, __dir__ = lazy_names(
     {
         "bag": "BagDriver",
         "driver": "Driver DriverState",
+        "guard": "Guard",
         "kinematic": "KinematicDriver",
         "mujoco": "MujocoDriver",
         "ros2": "Ros2Driver",

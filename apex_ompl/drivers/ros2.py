@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.controllers import Controllers
 from apex_ompl.drivers.driver import DriverState
+from apex_ompl.drivers.guard import Guard
 from apex_ompl.drivers.library import rclpy
 from apex_ompl.errors import DriverError, ParameterError
 from apex_ompl.robot.model import Robot
@@ -35,6 +36,7 @@ SILENCE = 0.5  # age of the state after which the robot counts as silent [s]
 STARTED = 10.0  # time to wait for controllers and the first state [s]
 SPUN = 0.05  # longest time between two looks at whether to end [s]
 DEPTH = 10  # messages that are kept
+MEMORY = 1.0  # for which commands are kept, to compare measured states with them [s]
 
 
 class Ros2Driver:
@@ -52,6 +54,7 @@ class Ros2Driver:
         self, robot: Robot, controllers: Mapping[str, Sequence[str]] | str, *, renamed: Mapping[str, str] | None = None,
         states: str = "/joint_states", node: str = "apex_ompl", lead: float = LEAD, silence: float = SILENCE,
         tolerance: float = START_TOLERANCE, started: float = STARTED,
+        guard: Guard | None = None,
     ) -> None:  # fmt: skip
         """Wait for the controllers and the first joint states, in which the robot is taken to rest.
 
@@ -66,6 +69,7 @@ class Ros2Driver:
             silence: Age of the state after which :meth:`state` says that the robot is silent [s].
             tolerance: Largest distance of the start of a motion from the commanded position [rad].
             started: Time to wait for controllers and states [s].
+            guard: How far the robot may be from its motion.
 
         Raises:
             MissingFileError: The extra ``ros2`` is not installed.
@@ -104,7 +108,7 @@ class Ros2Driver:
             self.close()
             raise
         self._message, self._point, self._ros_time = ros.JointTrajectory, ros.JointTrajectoryPoint, ros.Time
-        self._commands = Commands(self.names, self.limits, start, tolerance)
+        self._commands = Commands(self.names, self.limits, start, tolerance, (guard or Guard()).bounds(robot))
 
     def __repr__(self) -> str:
         """Return the controllers, and whether the driver is closed."""
@@ -131,30 +135,40 @@ class Ros2Driver:
             DriverError: It is older than ``silence``.
         """
         self._check_open()
-        with self._arrived:
-            assert self._measured is not None
-            stamp, positions, velocities = self._measured
-        at = (stamp - self._zero) / NANOSECONDS
-        age = self.time - at
+        state = self._last_state()
+        age = self.time - state.stamp
         if age > self._silence:
             raise DriverError(f"there were no joint states for {age:.3g} s")
-        return DriverState(at, positions, velocities)
+        return state
 
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         self._check_open()
         with self._lock:
             now = self.time
-            self._commands.send(motion, at, now)
-            self._commands.forget(now)
+            self._commands.send(motion, at, now, self.state())
+            self._commands.forget(now - MEMORY)
             self._publish(motion, at)
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
         self._check_open()
         with self._lock:
-            start = self.time + self._lead
-            self._publish(self._commands.stop(start), start)
+            self._stop()
+
+    @property
+    def fault(self) -> str:
+        """Why the driver stopped, in a sentence; else empty."""
+        return self._commands.fault
+
+    def recover(self) -> None:
+        """Take up motions again, where the robot is back at the position that the controllers hold.
+
+        Raises:
+            DriverError: The robot moves, is silent, or is not back: restart controllers and driver.
+        """
+        with self._lock:
+            self._commands.recover(self.state(), self.time, adopt=False)
 
     def close(self) -> None:
         """Leave the robot to the motion that it follows, which ends at rest, and end the node."""
@@ -172,6 +186,22 @@ class Ros2Driver:
     def _check_open(self) -> None:
         if self._closed:
             raise ParameterError("driver", "one that was closed", "an open one")
+
+    def _stop(self) -> None:
+        start = self.time + self._lead
+        self._publish(self._commands.stop(start), start)
+
+    def _last_state(self) -> DriverState:
+        with self._arrived:
+            assert self._measured is not None
+            stamp, positions, velocities = self._measured
+        return DriverState((stamp - self._zero) / NANOSECONDS, positions, velocities)
+
+    def _watch(self) -> None:
+        """Stop where the state that came last is too far from the commanded one."""
+        with self._lock:
+            if self._commands.watch(self._last_state()):
+                self._stop()
 
     def _spin(self) -> None:
         while not self._closed:
@@ -208,6 +238,8 @@ class Ros2Driver:
                 found = np.array([row[1:] for row in rows if row is not None])
                 self._measured = min(row[0] for row in rows if row is not None), found[:, 0], found[:, 1]
             self._arrived.notify_all()
+        if hasattr(self, "_commands") and self._measured is not None:
+            self._watch()
 
     def _publish(self, motion: Trajectory, at: float) -> None:
         """Send each controller its part of a motion from a time on [s]."""
