@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from apex_ompl.drivers.bag import BagDriver as BagDriver
     from apex_ompl.drivers.driver import Driver as Driver
     from apex_ompl.drivers.driver import DriverState as DriverState
+    from apex_ompl.drivers.franka import FrankaDriver as FrankaDriver
+    from apex_ompl.drivers.franka_arms import FrankaSettings as FrankaSettings
     from apex_ompl.drivers.guard import Guard as Guard
     from apex_ompl.drivers.kinematic import KinematicDriver as KinematicDriver
     from apex_ompl.drivers.mujoco import MujocoDriver as MujocoDriver
@@ -22,6 +24,8 @@ __all__, __getattr__, __dir__ = lazy_names(
     {
         "bag": "BagDriver",
         "driver": "Driver DriverState",
+        "franka": "FrankaDriver",
+        "franka_arms": "FrankaSettings",
         "guard": "Guard",
         "kinematic": "KinematicDriver",
         "mujoco": "MujocoDriver",

@@ -74,6 +74,10 @@ class Commands:
         self._check_start(motion, at)
         if measured is not None and self._bounds is not None:
             self._check_measured(motion, at, measured, self._bounds.start)
+        self.add(motion, at)
+
+    def add(self, motion: Trajectory, at: float) -> None:
+        """Replace what is commanded from a time on [s] by a motion that was checked."""
         kept = bisect_right(self._starts, at - CLOCK_ROUNDING)
         self._starts[kept:], self._motions[kept:] = [at], [motion]
 
