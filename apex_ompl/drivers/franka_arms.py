@@ -169,8 +169,11 @@ class FrankyArm:
 
     def error(self) -> str:
         """Return why the controller ended, or nothing while it runs."""
+        if self._robot.is_in_control:
+            return ""
         try:
-            return "" if self._robot.poll_motion() else "the controller ended"
+            self._robot.poll_motion()  # which raises what ended it
+            return "the controller ended"
         except Exception as error:  # of libfranka
             return _text(error)
 

@@ -72,7 +72,7 @@ def panda_py() -> Any:
     places = {
         "panda_py": ("Panda",), "panda_py.controllers": ("JointPosition",), "panda_py.libfranka": ("RealtimeConfig",),
     }  # fmt: skip
-    return _of_franka("panda_py", places)
+    return _of_franka("panda_py", places, "panda")
 
 
 def franky() -> Any:
@@ -81,14 +81,14 @@ def franky() -> Any:
     Raises:
         MissingFileError: The package ``franky-control`` is not installed.
     """
-    return _of_franka("franky", {"franky": ("JointImpedanceTracker", "RealtimeConfig", "Robot")})
+    return _of_franka("franky", {"franky": ("JointImpedanceTracker", "RealtimeConfig", "Robot")}, "fr3")
 
 
-def _of_franka(name: str, places: Mapping[str, tuple[str, ...]]) -> Any:
+def _of_franka(name: str, places: Mapping[str, tuple[str, ...]], extra: str) -> Any:
     try:
         with unforked():
             found = {one: getattr(import_module(module), one) for module, names in places.items() for one in names}
     except ImportError as error:
-        why = "install the extra: apex-ompl[franka]"
+        why = f"install the extra: apex-ompl[{extra}]"
         raise MissingFileError(name, "package for Franka's arms", why) from error
     return SimpleNamespace(**found)

@@ -271,7 +271,7 @@ def test_arms_that_do_not_answer_and_bad_calls(robot: Robot, tmp_path: Path, mon
 
 def test_a_missing_package_is_named(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "franky", None)
-    with pytest.raises(MissingFileError, match=r"package for Franka's arms 'franky'.*apex-ompl\[franka\]"):
+    with pytest.raises(MissingFileError, match=r"package for Franka's arms 'franky'.*apex-ompl\[fr3\]"):
         FrankaDriver(robot, arms(robot), package="franky-control")
 
 

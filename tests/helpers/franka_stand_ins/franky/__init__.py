@@ -17,7 +17,7 @@ class RealtimeConfig(enum.Enum):
 
 class Robot:
     def __init__(self, fci_hostname: str, *, realtime_config: Any = RealtimeConfig.Enforce) -> None:
-        self._arm = StandInArm(fci_hostname)
+        self._arm, self._fault = StandInArm(fci_hostname), ""
 
     def set_collision_behavior(self, torque_thresholds: float, force_thresholds: float) -> None:
         self._arm.thresholds = torque_thresholds, force_thresholds
@@ -27,11 +27,16 @@ class Robot:
         position, velocity = self._arm.measured()
         return SimpleNamespace(position=position, velocity=velocity)
 
+    @property
+    def is_in_control(self) -> bool:
+        self._fault = self._arm.fault() or self._fault
+        return not self._arm.failed
+
     def poll_motion(self) -> bool:
-        fault = self._arm.fault()
+        fault, self._fault = self._fault, ""
         if fault:
             raise RuntimeError(fault)
-        return not self._arm.failed
+        return True
 
     def recover_from_errors(self) -> bool:
         self._arm.recover()
