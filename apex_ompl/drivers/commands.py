@@ -113,7 +113,7 @@ class Commands:
         self.fault = f"{self.names[k]} was {off[k]:.3g} off its commanded position at {measured.stamp:.3f} s, {most}"
         return True
 
-    def recover(self, measured: DriverState, now: float, adopt: bool = True) -> None:
+    def recover(self, measured: DriverState, now: float, adopt: bool = True) -> Array:
         """Forget the fault.
 
         Args:
@@ -121,6 +121,9 @@ class Commands:
             now: The time [s].
             adopt: Whether rest in the measured position is commanded from now on. Otherwise the robot must be back at
                 the commanded one, to the guard's distance of a start.
+
+        Returns:
+            The commanded position, shape (dof,).
 
         Raises:
             DriverError: The robot moves, or is not back.
@@ -138,6 +141,8 @@ class Commands:
                 most = f"expected at most {self._bounds.start[k]:g}"
                 raise DriverError(f"{self.names[k]} is still {off[k]:.3g} off its commanded position, {most}")
         self.fault = ""
+        found: Array = self.states(np.array([now]))[0, 0]
+        return found
 
     def forget(self, now: float) -> None:
         """Drop motions that were replaced before a time [s], which ``states`` is not asked for again."""

@@ -77,8 +77,12 @@ class Driver(Protocol):
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
         ...
 
-    def recover(self) -> None:
-        """Take up motions again after a fault, from rest in the measured position.
+    def recover(self) -> Array:
+        """Take up motions again after a fault.
+
+        Returns:
+            The position in which the next motion starts, shape (dof,): the measured one, where the robot can be
+            commanded to rest there.
 
         Raises:
             ApexError: The robot moves, or cannot be commanded.

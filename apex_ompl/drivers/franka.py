@@ -21,12 +21,13 @@ import numpy as np
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
 from apex_ompl.drivers.franka_arms import JOINTS, FrankaSettings, package_of
-from apex_ompl.drivers.guard import Bounds, Guard
+from apex_ompl.drivers.guard import Guard, part_of
 from apex_ompl.drivers.streamer import Memory, Sent, Spec
 from apex_ompl.errors import DriverError, ParameterError
 from apex_ompl.robot.dynamics import Dynamics, Load
-from apex_ompl.robot.model import Limits, Robot
+from apex_ompl.robot.model import Robot
 from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_positive
 
@@ -75,12 +76,12 @@ class FrankaDriver:
         """
         check_positive(started, "started")
         self._settings, self._robot = settings or FrankaSettings(), robot
-        columns = _columns(robot, arms)
-        self.names = tuple(robot.joint_names[k] for k in columns)
-        self.limits = Limits(*(values[columns] for values in vars(robot.limits).values()))
-        self.package, self._columns = package_of(package), columns
+        if {len(joints) for joints in arms.values()} != {JOINTS}:
+            raise ParameterError("arms", dict(arms), "seven joints of each arm")
+        part = part_of(robot, [name for joints in arms.values() for name in joints], guard)
+        self.names, self.limits, self._columns, bounds = part
+        self.package = package_of(package)
         self._dynamics = Dynamics(robot, loads)
-        bounds = Bounds(*(row[columns] for row in (guard or Guard()).bounds(robot)))
         self._closed, self._lock, self._zero = False, threading.Lock(), time.monotonic()
         spec = Spec(
             self.package, tuple(arms), self._settings, self.names, self.limits, bounds, self._zero
@@ -158,7 +159,7 @@ class FrankaDriver:
             start = self.time + self._settings.lead
             self._hand_over(self._commands.stop(start), start)
 
-    def recover(self) -> None:
+    def recover(self) -> Array:
         """Recover the arms from errors, hold their measured positions, and take up motions again.
 
         Raises:
@@ -169,7 +170,7 @@ class FrankaDriver:
         with self._lock:
             self._connection.send(("recover",))
             state = self._answer("recovered", RECOVERED)
-            self._commands.recover(state, state.stamp)
+            return self._commands.recover(state, state.stamp)
 
     def close(self) -> None:
         """Leave the arms to the motion that they follow, and end their controllers at its end."""
@@ -248,13 +249,3 @@ class FrankaDriver:
     def _check_open(self) -> None:
         if self._closed:
             raise ParameterError("driver", "one that was closed", "an open one")
-
-
-def _columns(robot: Robot, arms: Mapping[str, Sequence[str]]) -> list[int]:
-    """Return where the joints of the arms are in a state of the robot."""
-    given = [name for joints in arms.values() for name in joints]
-    known = list(robot.joint_names)
-    sizes = {len(joints) for joints in arms.values()}
-    if sizes != {JOINTS} or len(set(given)) < len(given) or not set(given) <= set(known):
-        raise ParameterError("arms", dict(arms), f"seven joints of each arm, each once, of {', '.join(known)}")
-    return [known.index(name) for name in given]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from apex_ompl.robot.model import Robot
+from apex_ompl.errors import ParameterError
+from apex_ompl.robot.model import Limits, Robot
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_positive
 
@@ -60,6 +62,37 @@ class Guard:
         hands = np.isin(np.arange(robot.dof), robot.groups.get("hands", []))
         rows = (self.start, self.hand_start), (self.tracking, self.hand_tracking)
         return Bounds(*(np.where(hands, _any(hand), _any(joint)) for joint, hand in rows))
+
+
+class Part(NamedTuple):
+    """Some joints of a robot, which a driver drives.
+
+    Attributes:
+        names: Their names.
+        limits: Their limits.
+        columns: Where they are in a state of the robot.
+        bounds: How far they may be from their motion.
+    """
+
+    names: tuple[str, ...]
+    limits: Limits
+    columns: list[int]
+    bounds: Bounds
+
+
+def part_of(robot: Robot, joints: Sequence[str] | None, guard: Guard | None) -> Part:
+    """Return some joints of a robot, or all.
+
+    Raises:
+        ParameterError: No joint, an unknown one, or one given twice.
+    """
+    known = list(robot.joint_names)
+    names = tuple(known if joints is None else joints)
+    if isinstance(joints, str) or not names or len(set(names)) < len(names) or not set(names) <= set(known):
+        raise ParameterError("joints", joints, f"some of the joints {', '.join(known)}, each once")
+    columns = [known.index(name) for name in names]
+    limits = robot.limits if joints is None else Limits(*(row[columns] for row in vars(robot.limits).values()))
+    return Part(names, limits, columns, Bounds(*(row[columns] for row in (guard or Guard()).bounds(robot))))
 
 
 def _any(value: float | None) -> float:

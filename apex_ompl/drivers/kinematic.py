@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
-from apex_ompl.drivers.guard import Guard
+from apex_ompl.drivers.guard import Guard, part_of
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot.model import Robot
 from apex_ompl.timing.trajectory import Trajectory
@@ -32,25 +32,28 @@ class KinematicDriver:
 
     def __init__(
         self, robot: Robot, state: Array | None = None, *, clock: Callable[[], float] | None = None,
-        tolerance: float = START_TOLERANCE, guard: Guard | None = None,
+        tolerance: float = START_TOLERANCE, guard: Guard | None = None, joints: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
         """Rest in a state.
 
         Args:
             robot: The robot.
-            state: The state, shape (dof,); by default the home of the robot.
+            state: The state of all joints, shape (dof,); by default the home of the robot.
             clock: Returns the time, which never decreases [s], such as ``time.monotonic``.
             tolerance: Largest distance of the start of a motion from the commanded position [rad].
             guard: How far the robot may be from its motion.
+            joints: The joints that it drives; by default all.
 
         Raises:
-            ParameterError: The state has another shape or a number that is not finite, or is outside the limits.
+            ParameterError: A joint is unknown or given twice, or the state has another shape or a number that is not
+                finite, or is outside the limits.
         """
         at = finite_array(robot.home if state is None else state, "state")
         check_array(at, (robot.dof,), "state")
-        self.names, self.limits = robot.joint_names, robot.limits
-        self._commands = Commands(self.names, self.limits, at, tolerance, (guard or Guard()).bounds(robot))
-        self._pushed = np.zeros(robot.dof)
+        part = part_of(robot, joints, guard)
+        self.names, self.limits = part.names, part.limits
+        self._commands = Commands(part.names, part.limits, at[part.columns], tolerance, part.bounds)
+        self._pushed = np.zeros(len(part.names))
         fault = robot.limit_fault(at)
         if fault:
             raise ParameterError("state", fault, "a state within the limits")
@@ -120,12 +123,13 @@ class KinematicDriver:
             if self._commands.watch(self._measured(self.time)):
                 self._stop()
 
-    def recover(self) -> None:
+    def recover(self) -> Array:
         """Rest where the robot is, and take up motions again (:meth:`apex_ompl.drivers.driver.Driver.recover`)."""
         with self._open():
             now = self.time
-            self._commands.recover(self._measured(now), now)
+            found = self._commands.recover(self._measured(now), now)
             self._pushed[:] = 0.0
+            return found
 
     def close(self) -> None:
         """End it; other calls after it raise an ApexError."""

@@ -143,9 +143,9 @@ class MujocoDriver:
         """Why the driver stopped, in a sentence; else empty."""
         return self._commands.fault
 
-    def recover(self) -> None:
+    def recover(self) -> Array:
         """Hold the measured position, and take up motions again (:meth:`apex_ompl.drivers.driver.Driver.recover`)."""
-        self._commands.recover(self.state(), self.time)
+        return self._commands.recover(self.state(), self.time)
 
     def close(self) -> None:
         """Release the model and what draws it."""

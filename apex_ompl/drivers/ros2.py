@@ -161,14 +161,14 @@ class Ros2Driver:
         """Why the driver stopped, in a sentence; else empty."""
         return self._commands.fault
 
-    def recover(self) -> None:
+    def recover(self) -> Array:
         """Take up motions again, where the robot is back at the position that the controllers hold.
 
         Raises:
             DriverError: The robot moves, is silent, or is not back: restart controllers and driver.
         """
         with self._lock:
-            self._commands.recover(self.state(), self.time, adopt=False)
+            return self._commands.recover(self.state(), self.time, adopt=False)
 
     def close(self) -> None:
         """Leave the robot to the motion that it follows, which ends at rest, and end the node."""
