@@ -277,6 +277,7 @@ def _stream(streamer: Streamer, client: _Client, memory: Memory, spec: Spec, clo
         elif wait < -LATE:
             late += 1
             due = clock()
+    streamer.step(clock())  # the end of the motion
 
 
 def main() -> None:

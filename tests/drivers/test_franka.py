@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stand_ins_of_franka import STAND_INS, stand_ins
 from support import ROOT
 
 from apex_ompl.drivers import FrankaDriver, FrankaSettings
@@ -22,7 +23,6 @@ from apex_ompl.robot.dynamics import Dynamics
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.types import Array
 
-STAND_INS = ROOT / "tests" / "helpers" / "franka_stand_ins"
 ADDRESSES = "left.arm", "right.arm"
 SETTINGS = FrankaSettings(rate=250.0, realtime=False, lead=0.03)
 
@@ -81,19 +81,12 @@ def franky(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
     yield from arms_of("franky-control", robot, tmp_path, monkeypatch)
 
 
-def stand_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the stand-ins be found in place of the packages, here and in processes of the driver."""
-    for name in [one for one in sys.modules if one.split(".")[0] in ("panda_py", "franky", "stand_in_arm")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.syspath_prepend(str(STAND_INS))
-    monkeypatch.setenv("FRANKA_STAND_IN", str(tmp_path))
-
-
 def arms_of(package: str, robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Arms]:
-    stand_in(tmp_path, monkeypatch)
-    found = Arms(robot, tmp_path, package)
-    yield found
-    found.driver.close()
+    with stand_ins(monkeypatch):
+        monkeypatch.setenv("FRANKA_STAND_IN", str(tmp_path))
+        found = Arms(robot, tmp_path, package)
+        yield found
+        found.driver.close()
 
 
 def off(rows: Array, wanted: Callable[[float], Array], half: float) -> float:
@@ -234,7 +227,7 @@ os.kill(os.getpid(), 9)
 def test_a_client_that_is_killed_leaves_the_arms_at_rest(
     robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stand_in(tmp_path, monkeypatch)
+    monkeypatch.setenv("FRANKA_STAND_IN", str(tmp_path))
     for address in ADDRESSES:
         (tmp_path / f"{address}.there").touch()
     path = [str(STAND_INS), str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "drivers")]
@@ -253,16 +246,20 @@ def test_a_client_that_is_killed_leaves_the_arms_at_rest(
 
 
 def test_arms_that_do_not_answer_and_bad_calls(robot: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stand_in(tmp_path, monkeypatch)
+    monkeypatch.setenv("FRANKA_STAND_IN", str(tmp_path))
     (tmp_path / "left.arm.there").touch()
-    with pytest.raises(DriverError, match="the arm at right.arm cannot be connected: libfranka: Connection to FCI"):
-        FrankaDriver(robot, arms(robot), package="panda-python", settings=SETTINGS)
-    with pytest.raises(ParameterError, match="package: expected panda-python or franky-control, since both are"):
-        FrankaDriver(robot, arms(robot), settings=SETTINGS)
+    with stand_ins(monkeypatch):
+        words = "the arm at right.arm cannot be connected: libfranka: Connection to FCI"
+        with pytest.raises(DriverError, match=words):
+            FrankaDriver(robot, arms(robot), package="panda-python", settings=SETTINGS)
+        with pytest.raises(ParameterError, match="package: expected panda-python or franky-control, since both are"):
+            FrankaDriver(robot, arms(robot), settings=SETTINGS)
     with pytest.raises(ParameterError, match="package: expected panda-python or franky-control, got 'libfranka'"):
         FrankaDriver(robot, arms(robot), package="libfranka")
     with pytest.raises(ParameterError, match="arms: expected seven joints of each arm"):
         FrankaDriver(robot, {"a": robot.joint_names[:6]})
+    with pytest.raises(ParameterError, match="joints: expected some of the joints"):
+        FrankaDriver(robot, {"a": robot.joint_names[:7], "b": robot.joint_names[:7]})
     with pytest.raises(ParameterError, match="stiffness"):
         FrankaSettings(stiffness=(600.0,) * 6)
     with pytest.raises(ParameterError, match="rate"):

@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-import sys
+import importlib
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from support import ROOT
+from stand_ins_of_franka import STAND_INS, stand_ins
 
 from apex_ompl.drivers import FrankaSettings
 from apex_ompl.drivers.franka_arms import FrankyArm, PandaArm, package_of
 from apex_ompl.errors import DriverError, ParameterError
 
-STAND_INS = ROOT / "tests" / "helpers" / "franka_stand_ins"
 Q, V, TORQUE = np.linspace(-1.0, 1.0, 7), np.linspace(0.1, 0.7, 7), np.linspace(-3.0, 3.0, 7)
-
-
-def stand_in_of(name: str, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """A stand-in beside the real package, which stays imported."""
-    real = {one: module for one, module in sys.modules.items() if one.split(".")[0] == name}
-    for one in real:
-        monkeypatch.delitem(sys.modules, one)
-    monkeypatch.syspath_prepend(str(STAND_INS))
-    found = __import__(name, fromlist=["x"])
-    assert str(STAND_INS) in str(found.__file__)
-    return found
 
 
 def public(kind: Any) -> set[str]:
@@ -101,7 +89,9 @@ def test_panda_py_has_what_its_stand_in_has(monkeypatch: pytest.MonkeyPatch) -> 
     from panda_py.controllers import JointPosition
     from panda_py.libfranka import RealtimeConfig, Robot, RobotState
 
-    stand_in = stand_in_of("panda_py", monkeypatch)
+    with stand_ins(monkeypatch):
+        stand_in = importlib.import_module("panda_py")
+    assert str(STAND_INS) in str(stand_in.__file__)
     for kind in (Panda, JointPosition, RealtimeConfig, Robot):
         same = getattr(stand_in, kind.__name__)
         assert public(same) and public(same) <= set(dir(kind)), kind
@@ -112,7 +102,9 @@ def test_franky_has_what_its_stand_in_has(monkeypatch: pytest.MonkeyPatch) -> No
     pytest.importorskip("franky")
     from franky import JointImpedanceTracker, JointState, RealtimeConfig, Robot
 
-    stand_in = stand_in_of("franky", monkeypatch)
+    with stand_ins(monkeypatch):
+        stand_in = importlib.import_module("franky")
+    assert str(STAND_INS) in str(stand_in.__file__)
     for kind in (Robot, JointImpedanceTracker, RealtimeConfig):
         same = getattr(stand_in, kind.__name__)
         assert public(same) and public(same) <= set(dir(kind)), kind
