@@ -1,8 +1,9 @@
-"""The optional libraries: MuJoCo, the client library of ROS 2, and rosbags."""
+"""The optional libraries: MuJoCo, the client library of ROS 2, rosbags, and those of Franka's arms."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from ctypes.util import find_library
 from importlib import import_module
 from types import SimpleNamespace
@@ -60,3 +61,34 @@ def rosbags() -> Any:
     return SimpleNamespace(
         Writer=bags.Writer, plugin=bags.StoragePlugin, types=types.get_typestore(types.Stores.ROS2_JAZZY)
     )
+
+
+def panda_py() -> Any:
+    """Return what drivers use of ``panda_py``, as one namespace.
+
+    Raises:
+        MissingFileError: The package ``panda-python`` is not installed.
+    """
+    places = {
+        "panda_py": ("Panda",), "panda_py.controllers": ("JointPosition",), "panda_py.libfranka": ("RealtimeConfig",),
+    }  # fmt: skip
+    return _of_franka("panda_py", places, "panda")
+
+
+def franky() -> Any:
+    """Return what drivers use of ``franky``, as one namespace.
+
+    Raises:
+        MissingFileError: The package ``franky-control`` is not installed.
+    """
+    return _of_franka("franky", {"franky": ("JointImpedanceTracker", "RealtimeConfig", "Robot")}, "fr3")
+
+
+def _of_franka(name: str, places: Mapping[str, tuple[str, ...]], extra: str) -> Any:
+    try:
+        with unforked():
+            found = {one: getattr(import_module(module), one) for module, names in places.items() for one in names}
+    except ImportError as error:
+        why = f"install the extra: apex-ompl[{extra}]"
+        raise MissingFileError(name, "package for Franka's arms", why) from error
+    return SimpleNamespace(**found)

@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.controllers import Controllers
 from apex_ompl.drivers.driver import DriverState
+from apex_ompl.drivers.guard import Guard
 from apex_ompl.drivers.library import rclpy
 from apex_ompl.drivers.outlets import ActionOutlet, TopicOutlet
 from apex_ompl.errors import DriverError, ParameterError
@@ -39,6 +40,7 @@ SILENCE = 0.5  # age of the state after which the robot counts as silent [s]
 STARTED = 10.0  # time to wait for controllers and the first state [s]
 SPUN = 0.05  # longest time between two looks at whether to end [s]
 KEPT = 1000  # measured positions that are kept
+MEMORY = 1.0  # for which commands are kept, to compare measured states with them [s]
 
 
 class Ros2Driver:
@@ -57,6 +59,7 @@ class Ros2Driver:
         self, robot: Robot, controllers: Mapping[str, Sequence[str]] | str, *, renamed: Mapping[str, str] | None = None,
         states: str = "/joint_states", node: Any = "apex_ompl", lead: float = LEAD, silence: float = SILENCE,
         tolerance: float = START_TOLERANCE, started: float = STARTED, transit: float = TRANSIT, action: bool = False,
+        guard: Guard | None = None,
     ) -> None:  # fmt: skip
         """Wait for the controllers and the first joint states, in which the robot is taken to rest.
 
@@ -76,6 +79,7 @@ class Ros2Driver:
                 would jump to it [s].
             action: Whether motions go as goals of the actions ``/NAME/follow_joint_trajectory``, of which each replaces
                 the one before, in place of the topics; what they answer is then an error of :meth:`state`.
+            guard: How far the robot may be from its motion.
 
         Raises:
             MissingFileError: The extra ``ros2`` is not installed, or ``control_msgs`` for actions.
@@ -90,7 +94,7 @@ class Ros2Driver:
         self._lead, self._silence, self._transit, self._closed = lead, silence, transit, False
         self._lock, self._arrived = threading.Lock(), threading.Condition()
         self._measured: tuple[int, Array, Array] | None = None
-        self._answer = ""
+        self._answer, self._bounds = "", (guard or Guard()).bounds(robot)
         self._history = deque[tuple[int, Array]](maxlen=KEPT)
         self._seen: dict[str, tuple[int, float, float]] = {}
         atexit.register(self.close)  # a thread that still spins then would crash the process
@@ -114,7 +118,7 @@ class Ros2Driver:
             self.close()
             raise
         self._message, self._point, self._ros_time = ros.JointTrajectory, ros.JointTrajectoryPoint, ros.Time
-        self._commands = Commands(self.names, self.limits, start, tolerance)
+        self._commands = Commands(self.names, self.limits, start, tolerance, self._bounds)
 
     def __repr__(self) -> str:
         """Return the controllers, and whether the driver is closed."""
@@ -143,22 +147,15 @@ class Ros2Driver:
         self._check_open()
         if self._answer:
             raise DriverError(self._answer)
-        with self._arrived:
-            assert self._measured is not None
-            stamp, positions, velocities = self._measured
-        at = (stamp - self._zero) / NANOSECONDS
-        age = self.time - at
-        if age > self._silence:
-            raise DriverError(f"there were no joint states for {age:.3g} s")
-        return DriverState(at, positions, velocities)
+        return self._fresh_state()
 
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         self._check_open()
         with self._lock:
             now = self.time
-            self._commands.send(motion, at, now + self._transit)
-            self._commands.forget(now - self._silence)
+            self._commands.send(motion, at, now + self._transit, self._fresh_state())
+            self._commands.forget(now - max(MEMORY, self._silence))
             self._answer = ""
             self._publish(motion, at)
 
@@ -196,14 +193,27 @@ class Ros2Driver:
         positions = self.state().positions
         self._check_limits(positions)
         with self._lock:
-            self._commands = Commands(self.names, self.limits, positions, self._commands.tolerance)
+            self._commands = Commands(self.names, self.limits, positions, self._commands.tolerance, self._bounds)
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
         self._check_open()
         with self._lock:
-            start = self.time + self._lead
-            self._publish(self._commands.stop(start), start)
+            self._stop()
+
+    @property
+    def fault(self) -> str:
+        """Why the driver stopped, in a sentence; else empty."""
+        return self._commands.fault
+
+    def recover(self) -> Array:
+        """Take up motions again, where the robot is back at the position that the controllers hold.
+
+        Raises:
+            DriverError: The robot moves, is silent, or is not back: restart controllers and driver.
+        """
+        with self._lock:
+            return self._commands.recover(self.state(), self.time, adopt=False)
 
     def close(self) -> None:
         """Leave the robot to the motion that it follows, which ends at rest, and end the node."""
@@ -227,6 +237,30 @@ class Ros2Driver:
         fault = self._robot.limit_fault(positions)
         if fault:
             raise DriverError(f"the robot is outside its limits: {fault}")
+
+    def _stop(self) -> None:
+        start = self.time + self._lead
+        self._publish(self._commands.stop(start), start)
+
+    def _fresh_state(self) -> DriverState:
+        """Return the last measured state where the robot is not silent."""
+        state = self._last_state()
+        age = self.time - state.stamp
+        if age > self._silence:
+            raise DriverError(f"there were no joint states for {age:.3g} s")
+        return state
+
+    def _last_state(self) -> DriverState:
+        with self._arrived:
+            assert self._measured is not None
+            stamp, positions, velocities = self._measured
+        return DriverState((stamp - self._zero) / NANOSECONDS, positions, velocities)
+
+    def _watch(self) -> None:
+        """Stop where the state that came last is too far from the commanded one."""
+        with self._lock:
+            if self._commands.watch(self._last_state()):
+                self._stop()
 
     def _first_state(self, states: str, started: float) -> Array:
         """Wait for all controllers and a state of all joints, and return it, shape (dof,)."""
@@ -264,6 +298,8 @@ class Ros2Driver:
                 if not self._history or stamp > self._history[-1][0]:
                     self._history.append((stamp, positions))
             self._arrived.notify_all()
+        if hasattr(self, "_commands") and self._measured is not None:
+            self._watch()
 
     def _publish(self, motion: Trajectory, at: float) -> None:
         """Send each controller its part of a motion from a time on [s]."""
