@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,29 @@ def deleted() -> Any:
 
 def joints(robot: Robot, q: Array) -> JointState:
     return JointState(name=[stand_ins_of.PREFIX + name for name in robot.joint_names], position=q.tolist())
+
+
+def set_parameter(client: Any, name: str, value: Any) -> Any:
+    """Set a parameter of the node, and return its answer."""
+    service = client.node.create_client(SetParameters, "/apex_ompl/set_parameters")
+    try:
+        assert service.wait_for_service(timeout_sec=30.0)
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        answer = service.call_async(request)
+        (result,) = client.wait(lambda: answer.result() if answer.done() else None).results
+        return result
+    finally:
+        client.node.destroy_client(service)
+
+
+@contextmanager
+def slow(client: Any) -> Iterator[None]:
+    """Let the node plan slow motions inside the block."""
+    assert set_parameter(client, "speed", 0.15).successful
+    try:
+        yield
+    finally:
+        assert set_parameter(client, "speed", 1.0).successful
 
 
 def reached_state(robot: Robot, stand_ins: Any) -> Array:
@@ -220,10 +244,11 @@ def test_a_motion_stops_before_what_comes_into_its_way(robot: Robot, stand_ins: 
     at = robot.link_pose(swung(robot, -0.5), "left_hand_palm")[:3, 3]
     box = Obstacle(name="box", box=(0.06, 0.06, 0.06), position=tuple(at))
     count, since = len(client.outcomes), time.time_ns()
-    client.publishers["goal/joints"].publish(joints(robot, second))
-    client.wait(lambda: np.abs(reached_state(robot, stand_ins)[0] - first[0]) > 0.1)
-    client.publishers["world"].publish(MarkerArray(markers=[client_of.marker_of(1, box.box, at)]))
-    assert client.wait(lambda: client.outcomes[count:]) == ["reached"]
+    with slow(client):  # so that there is time to stop on a busy machine
+        client.publishers["goal/joints"].publish(joints(robot, second))
+        client.wait(lambda: np.abs(reached_state(robot, stand_ins)[0] - first[0]) > 0.1)
+        client.publishers["world"].publish(MarkerArray(markers=[client_of.marker_of(1, box.box, at)]))
+        assert client.wait(lambda: client.outcomes[count:]) == ["reached"]
     checker = CollisionChecker(robot, [box])
     assert all(checker.is_free(q) for q in followed_since(stand_ins, since, robot)[::5])
     assert np.abs(reached_state(robot, stand_ins) - second).max() <= ALIKE
@@ -315,13 +340,8 @@ def test_a_robot_that_falls_silent_ends_the_motion(robot: Robot, stand_ins: Any,
 
 
 def test_parameters_are_checked_when_they_are_set(client: Any, robot: Robot) -> None:
-    service = client.node.create_client(SetParameters, "/apex_ompl/set_parameters")
-    assert service.wait_for_service(10.0)
-
     def told(name: str, value: Any) -> tuple[bool, str]:
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
-        answer = service.call_async(request)
-        (result,) = client.wait(lambda: answer.result() if answer.done() else None).results
+        result = set_parameter(client, name, value)
         return result.successful, result.reason
 
     assert told("speed", 0.7) == (True, "") and told("speed", 1.0)[0]
