@@ -34,6 +34,8 @@ problem = problem.model_copy(update={"start": start})  # the robot starts where 
 with Loop(problem, settings=LoopSettings(error=0.01, fastest=0.3, period=0.025)) as loop:
     while loop.outcome is None:
         now, state = driver.time, driver.state()
+        if driver.fault:
+            loop.abort(driver.fault)
         if (seen := camera.look(now)) is not None:
             loop.observe(now, seen)
         command = loop.step(now, state.positions + (now - state.stamp) * state.velocities)

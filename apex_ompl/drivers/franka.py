@@ -83,9 +83,7 @@ class FrankaDriver:
         self.package = package_of(package)
         self._dynamics = Dynamics(robot, loads)
         self._closed, self._lock, self._zero = False, threading.Lock(), time.monotonic()
-        spec = Spec(
-            self.package, tuple(arms), self._settings, self.names, self.limits, bounds, self._zero
-        )  # fmt: skip
+        spec = Spec(self.package, tuple(arms), self._settings, self.names, self.limits, bounds, self._zero)
         atexit.register(self.close)
         try:
             self._start(spec)
@@ -103,9 +101,7 @@ class FrankaDriver:
 
     def __repr__(self) -> str:
         """Return the package, the number of joints, and whether the driver is closed."""
-        return one_line(
-            "FrankaDriver", self.package, f"{len(self.names)} joints", "closed" if self._closed else ""
-        )  # fmt: skip
+        return one_line("FrankaDriver", self.package, f"{len(self.names)} joints", "closed" if self._closed else "")
 
     @property
     def time(self) -> float:

@@ -197,8 +197,9 @@ def package_of(package: str | None) -> str:
     known = " or ".join(PACKAGES)
     if package is None:
         found = [name for name, module in PACKAGES.items() if find_spec(module) is not None]
-        if len(found) != 1:
-            library.franky() if not found else None
+        if not found:
+            library.franky()  # which says what to install
+        if len(found) > 1:
             raise ParameterError("package", package, f"{known}, since both are installed")
         return found[0]
     if package not in PACKAGES:

@@ -39,12 +39,7 @@ def rclpy() -> Any:
         "rclpy.qos": ("qos_profile_sensor_data",), "rclpy.time": ("Time",), "sensor_msgs.msg": ("JointState",),
         "trajectory_msgs.msg": ("JointTrajectory", "JointTrajectoryPoint"),
     }  # fmt: skip
-    try:
-        with unforked():
-            found = {name: getattr(import_module(module), name) for module, names in places.items() for name in names}
-    except ImportError as error:
-        raise MissingFileError("rclpy", "package for ROS 2", "install the extra: apex-ompl[ros2]") from error
-    return SimpleNamespace(**found)
+    return names_of(places, "rclpy", "ROS 2", "ros2")
 
 
 def rosbags() -> Any:
@@ -72,7 +67,7 @@ def panda_py() -> Any:
     places = {
         "panda_py": ("Panda",), "panda_py.controllers": ("JointPosition",), "panda_py.libfranka": ("RealtimeConfig",),
     }  # fmt: skip
-    return _of_franka("panda_py", places, "panda")
+    return names_of(places, "panda_py", "Franka's arms", "panda")
 
 
 def franky() -> Any:
@@ -81,14 +76,25 @@ def franky() -> Any:
     Raises:
         MissingFileError: The package ``franky-control`` is not installed.
     """
-    return _of_franka("franky", {"franky": ("JointImpedanceTracker", "RealtimeConfig", "Robot")}, "fr3")
+    places = {"franky": ("JointImpedanceTracker", "RealtimeConfig", "Robot")}
+    return names_of(places, "franky", "Franka's arms", "fr3")
 
 
-def _of_franka(name: str, places: Mapping[str, tuple[str, ...]], extra: str) -> Any:
+def names_of(places: Mapping[str, tuple[str, ...]], package: str, purpose: str, extra: str) -> Any:
+    """Return names of an optional package as one namespace.
+
+    Args:
+        places: The names by the modules that have them.
+        package: Name of the package.
+        purpose: What it is for.
+        extra: The extra that installs it.
+
+    Raises:
+        MissingFileError: It is not installed.
+    """
     try:
         with unforked():
-            found = {one: getattr(import_module(module), one) for module, names in places.items() for one in names}
+            found = {name: getattr(import_module(module), name) for module, names in places.items() for name in names}
     except ImportError as error:
-        why = f"install the extra: apex-ompl[{extra}]"
-        raise MissingFileError(name, "package for Franka's arms", why) from error
+        raise MissingFileError(package, f"package for {purpose}", f"install the extra: apex-ompl[{extra}]") from error
     return SimpleNamespace(**found)

@@ -145,6 +145,7 @@ class MujocoDriver:
 
     def recover(self) -> Array:
         """Hold the measured position, and take up motions again (:meth:`apex_ompl.drivers.driver.Driver.recover`)."""
+        self._check_open()
         return self._commands.recover(self.state(), self.time)
 
     def close(self) -> None:

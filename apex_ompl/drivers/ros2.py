@@ -94,7 +94,7 @@ class Ros2Driver:
         self._lead, self._silence, self._transit, self._closed = lead, silence, transit, False
         self._lock, self._arrived = threading.Lock(), threading.Condition()
         self._measured: tuple[int, Array, Array] | None = None
-        self._answer, self._bounds = "", (guard or Guard()).bounds(robot)
+        self._answer = ""
         self._history = deque[tuple[int, Array]](maxlen=KEPT)
         self._seen: dict[str, tuple[int, float, float]] = {}
         atexit.register(self.close)  # a thread that still spins then would crash the process
@@ -118,7 +118,7 @@ class Ros2Driver:
             self.close()
             raise
         self._message, self._point, self._ros_time = ros.JointTrajectory, ros.JointTrajectoryPoint, ros.Time
-        self._commands = Commands(self.names, self.limits, start, tolerance, self._bounds)
+        self._commands = Commands(self.names, self.limits, start, tolerance, (guard or Guard()).bounds(robot))
 
     def __repr__(self) -> str:
         """Return the controllers, and whether the driver is closed."""
@@ -183,17 +183,16 @@ class Ros2Driver:
             return self._commands.states(np.array([at]))[:, 0]
 
     def take_over(self) -> None:
-        """Take the robot to rest where it was measured last, as where others moved it.
+        """Take up motions again where the robot was measured last, as where others moved it.
 
         Raises:
-            DriverError: It is silent, or outside its limits, or a motion is under way.
+            DriverError: It is silent, outside its limits, or moves.
         """
-        if self.time < self.end:
-            raise DriverError("a motion is under way")
-        positions = self.state().positions
-        self._check_limits(positions)
+        self._check_open()
         with self._lock:
-            self._commands = Commands(self.names, self.limits, positions, self._commands.tolerance, self._bounds)
+            state = self._fresh_state()
+            self._check_limits(state.positions)
+            self._commands.recover(state, self.time)
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
@@ -212,8 +211,9 @@ class Ros2Driver:
         Raises:
             DriverError: The robot moves, is silent, or is not back: restart controllers and driver.
         """
+        self._check_open()
         with self._lock:
-            return self._commands.recover(self.state(), self.time, adopt=False)
+            return self._commands.recover(self._fresh_state(), self.time, adopt=False)
 
     def close(self) -> None:
         """Leave the robot to the motion that it follows, which ends at rest, and end the node."""
@@ -239,8 +239,11 @@ class Ros2Driver:
             raise DriverError(f"the robot is outside its limits: {fault}")
 
     def _stop(self) -> None:
-        start = self.time + self._lead
-        self._publish(self._commands.stop(start), start)
+        """Stop what is under way or waits; at rest nothing is sent, since others may move the robot."""
+        now = self.time
+        if now < self._commands.end:
+            start = now + self._lead
+            self._publish(self._commands.stop(start), start)
 
     def _fresh_state(self) -> DriverState:
         """Return the last measured state where the robot is not silent."""

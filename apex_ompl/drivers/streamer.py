@@ -250,10 +250,10 @@ class _Client:
 
 
 def _stream(streamer: Streamer, client: _Client, memory: Memory, spec: Spec, clock: Callable[[], float]) -> None:
-    """Set references until the driver is closed or gone, and the motion under way has ended."""
-    period, closed, cycles, late = 1.0 / spec.settings.rate, False, 0, 0
+    """Set references until the driver is closed or killed, and the motion under way has ended."""
+    period, cycles, late = 1.0 / spec.settings.rate, 0, 0
     due = clock()
-    while not ((closed or client.gone) and due > streamer.commands.end):
+    while not (client.gone and due > streamer.commands.end):
         now = clock()
         state, stop = streamer.step(now)
         memory.write(state, cycles, late)
@@ -267,8 +267,6 @@ def _stream(streamer: Streamer, client: _Client, memory: Memory, spec: Spec, clo
                 client.say("recovered", streamer.recover(clock()))
             except Exception as error:  # of the package, or that the robot moves
                 client.say("unrecovered", str(error))
-        elif message is not None:
-            closed = True
         cycles += 1
         due += period
         wait = due - clock()

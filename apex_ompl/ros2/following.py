@@ -21,7 +21,7 @@ from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.files import NANOSECONDS
 from apex_ompl.types import Array
 
-SETTLED = 0.2  # time of rest after which measured positions are compared with commanded ones [s]
+SETTLED = 0.2  # time of rest after which a robot that left its motion is taken to be where it is measured [s]
 LOOK = 0.01  # between two looks at the robot [s]
 TICK = 0.001  # between two looks at the clock in the closed loop [s]
 REPLACED, CHANGED = "a new goal came", "the world changed"
@@ -87,7 +87,7 @@ class Follower:
         """
         ended: Ended | None = None
         while ended is None:
-            self._synchronize()
+            self.synchronize()
             ended = self._by_loop(target) if self._moves() else self._by_plan(target)
         return ended
 
@@ -102,15 +102,15 @@ class Follower:
         """Return a time of the driver by the node's clock [ns]."""
         return int(round(at * NANOSECONDS)) - int(self.driver.times_of(0) * NANOSECONDS)
 
-    def _synchronize(self) -> None:
-        """Take a robot at rest to be where it is measured, where others have moved it."""
-        driver, measured = self.driver, self.driver.state().positions
-        if driver.time < driver.end + SETTLED:
-            return
-        off = np.abs(measured - driver.commanded(driver.time)[0])
-        if off.max() > self.settings().tolerance:
+    def synchronize(self) -> None:
+        """Take the robot to be where it is measured, where it left its motion or others have moved it."""
+        driver = self.driver
+        fault = driver.fault
+        if fault:
+            while driver.time < driver.end + SETTLED:
+                time.sleep(LOOK)
             driver.take_over()
-            self.tell(f"{driver.names[int(off.argmax())]} was moved by {off.max():.3g} rad by others")
+            self.tell(f"starting from where the robot is, since {fault}")
 
     def _start(self) -> dict[str, float]:
         """Return the state in which the robot will come to rest, by joint names."""
@@ -170,16 +170,11 @@ class Follower:
 
     def _fault(self) -> Ended | None:
         """Return how a motion ends where the robot does not follow it."""
-        driver = self.driver
         try:
-            state = driver.state()
+            self.driver.state()
         except DriverError as error:
             return Ended("aborted", str(error))
-        off = np.abs(state.positions - driver.commanded(state.stamp)[0])
-        if off.max() <= self.settings().tolerance:
-            return None
-        k = int(off.argmax())
-        return Ended("aborted", f"{driver.names[k]} is {off[k]:.3g} rad from where it should be")
+        return Ended("aborted", self.driver.fault) if self.driver.fault else None
 
     def _remaining_fault(self, motion: Trajectory, start: float) -> str:
         """Return why the remaining motion is not free in the world as it is now, or nothing."""
@@ -219,6 +214,8 @@ class Follower:
         interruption = self._interruption()
         if interruption is not None:
             loop.abort(interruption.reason)
+        elif self.driver.fault:
+            loop.abort(self.driver.fault)
         elif self.inbox.world:
             loop.abort(CHANGED)
         for stamp, obstacles in self.scene.observations(self.state_at):

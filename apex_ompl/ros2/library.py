@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from importlib import import_module
-from types import SimpleNamespace
 from typing import Any
 
-from apex_ompl.errors import MissingFileError
-from apex_ompl.util.forking import unforked
+from apex_ompl.drivers.library import names_of
 
 NEEDED = {
     "rclpy": ("Context", "Parameter", "create_node", "init"), "rclpy.executors": ("SingleThreadedExecutor",),
@@ -30,14 +28,10 @@ def ros2() -> Any:
     Raises:
         MissingFileError: The extra ``ros2`` is not installed, nor a ROS 2 of the system sourced.
     """
-    try:
-        with unforked():
-            found = {name: getattr(import_module(module), name) for module, names in NEEDED.items() for name in names}
-    except ImportError as error:
-        raise MissingFileError("rclpy", "package for ROS 2", "install the extra: apex-ompl[ros2]") from error
+    found = names_of(NEEDED, "rclpy", "ROS 2", "ros2")
     for module, names in OPTIONAL.items():
         try:
-            found |= {name: getattr(import_module(module), name) for name in names}
+            vars(found).update({name: getattr(import_module(module), name) for name in names})
         except ImportError:
-            found |= dict.fromkeys(names)
-    return SimpleNamespace(**found)
+            vars(found).update(dict.fromkeys(names))
+    return found

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.drivers.guard import Guard
 from apex_ompl.drivers.ros2 import Ros2Driver
 from apex_ompl.errors import ApexError, DriverError, ParameterError
 from apex_ompl.goals.pose_goal import PoseGoal
@@ -96,8 +97,9 @@ class ApexNode:
         self._wait_for_time()
         renamed = settings.ros_names()
         self._driver = Ros2Driver(
-            robot, controllers, renamed=renamed, node=node, started=STARTED, action=settings.action
-        )
+            robot, controllers, renamed=renamed, node=node, started=STARTED, action=settings.action,
+            guard=Guard(*4 * (settings.tolerance,)),
+        )  # fmt: skip
         self._joints = {renamed.get(name, name): name for name in robot.joint_names}
         self._follower = Follower(self._driver, self._scene, self._inbox, lambda: self._parameters.now, self._tell)
         self._warm_up()
@@ -182,11 +184,11 @@ class ApexNode:
         if self._closed:
             return
         self._closed = True
-        if hasattr(self, "_driver"):
-            self._driver.close()
-        if hasattr(self, "_thread"):
+        if hasattr(self, "_thread"):  # whose callbacks use the driver
             self._thread.join()
             self._executor.shutdown()
+        if hasattr(self, "_driver"):
+            self._driver.close()
         if hasattr(self, "_node"):
             self._node.destroy_node()
         self._context.try_shutdown()
@@ -194,6 +196,7 @@ class ApexNode:
     def _go(self, goal: Goal) -> None:
         """Go to a goal, and tell how that ended."""
         try:
+            self._follower.synchronize()  # joints that the goal leaves out stay where they are
             self._follower.refresh()
             target = self._target(goal)
             self._draw(target)

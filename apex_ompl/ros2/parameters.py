@@ -37,6 +37,7 @@ class NodeSettings:
         frames: Poses of frames in the world, ``NAME=x y z qx qy qz qw``.
         goal_frames: Hands, links or held objects that take goals as poses.
         tracked: Obstacles of the problem whose poses come on topics.
+        tolerance: Largest distance of a joint from where it should be [rad].
         action: Whether motions go to the controllers as actions.
         closed_loop: One of ``CLOSED_LOOP``.
         method: Replanner of the closed loop.
@@ -48,7 +49,6 @@ class NodeSettings:
         speed: Share of the velocity limits.
         planning_time: Time for a plan [s].
         lead: Time between a plan and the start of its motion [s].
-        tolerance: Largest distance of a joint from where it should be [rad].
         cell: Edge of the cells that point clouds are thinned by [m].
         margin: Distance from the robot up to which points are its own [m].
         seed: Seed of random choices.
@@ -64,6 +64,7 @@ class NodeSettings:
         ("",), "hands, links or held objects that take goals as poses; the hands by default", fixed=True
     )
     tracked: tuple[str, ...] = _known(("",), "obstacles of the problem whose poses come on ~/object/NAME", fixed=True)
+    tolerance: float = _known(0.05, "largest distance of a joint from where it should be [rad]", 1e-4, 3.0, fixed=True)
     action: bool = _known(False, "send motions as FollowJointTrajectory actions, not by topic", fixed=True)
     closed_loop: str = _known("auto", f"use of the closed loop: {', '.join(CLOSED_LOOP)}")
     method: str = _known("apex", "replanner of the closed loop")
@@ -75,7 +76,6 @@ class NodeSettings:
     speed: float = _known(0.5, "share of the velocity limits", 0.001, 1.0)
     planning_time: float = _known(5.0, "time for a plan [s]", 0.01, 600.0)
     lead: float = _known(0.05, "time between a plan and the start of its motion [s]", 0.005, 10.0)
-    tolerance: float = _known(0.05, "largest distance of a joint from where it should be [rad]", 1e-4, 3.0)
     cell: float = _known(0.02, "edge of the cells that point clouds are thinned by [m]", 0.001, 0.5)
     margin: float = _known(0.02, "distance from the robot up to which points are its own [m]", 0.0, 0.5)
     seed: int = _known(0, "seed of random choices", 0, 2**31 - 1)

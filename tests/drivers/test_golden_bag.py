@@ -11,6 +11,7 @@ import golden_bag
 import numpy as np
 import pytest
 import trajectory_rules as rules
+from bags import read
 
 from apex_ompl.drivers import BagDriver
 from apex_ompl.robot import Robot
@@ -19,18 +20,6 @@ from apex_ompl.timing import Trajectory, time_path
 pytest.importorskip("rosbags")
 
 TOPICS = [f"/{name}/joint_trajectory" for name in golden_bag.CONTROLLERS]
-
-
-def read(folder: Path) -> dict[str, list[tuple[int, Any]]]:
-    """The messages of each topic, with the times in the bag [ns]."""
-    from rosbags.rosbag2 import Reader
-    from rosbags.typesys import Stores, get_typestore
-
-    types, found = get_typestore(Stores.ROS2_JAZZY), dict[str, list[tuple[int, Any]]]()
-    with Reader(folder) as reader:
-        for connection, time, data in reader.messages():
-            found.setdefault(connection.topic, []).append((time, types.deserialize_cdr(data, connection.msgtype)))
-    return found
 
 
 def limits_of(robot: Robot) -> dict[str, tuple[float, float, float, float]]:

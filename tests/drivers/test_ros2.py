@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -29,12 +28,8 @@ stand_ins_of = benchmark_script("physics.stand_ins")
 
 @pytest.fixture(scope="module", autouse=True)
 def _alone() -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_DOMAIN_ID")}
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-    yield
-    for name, value in before.items():
-        os.environ.pop(name) if value is None else os.environ.__setitem__(name, value)
+    with benchmark_script("physics.ros2_client").alone():
+        yield
 
 
 @pytest.fixture

@@ -117,3 +117,22 @@ def test_a_start_off_the_measured_position_is_refused(robot: Robot, stuck: Stuck
         driver.send(motion_of(robot, 0.3), driver.time + 0.2)
     driver.close()
     assert not stuck.messages
+
+
+def test_at_rest_others_may_move_the_robot(robot: Robot, stuck: StuckRobot) -> None:
+    driver = Ros2Driver(robot, "arms", started=20.0, silence=10.0)
+    stuck.at = robot.home + 0.2 * (np.arange(robot.dof) == 0)
+    wait(lambda: driver.fault)
+    driver.stop()
+    with pytest.raises(DriverError, match="the robot was stopped, since left_joint1 was 0.2 off"):
+        driver.send(motion_of(robot, 0.3), driver.time + 0.2)
+    wait(lambda: np.abs(driver.state().positions - stuck.at).max() < 1e-9)
+    driver.take_over()
+    assert not driver.fault
+    time.sleep(0.1)  # for messages to come, if there were any
+    assert not stuck.messages  # which would pull the robot back
+    goal = stuck.at + 0.3 * (np.arange(robot.dof) == 0)
+    motion = time_path(np.stack([stuck.at, goal]), robot.limits, robot.joint_names).trajectory
+    driver.send(motion, driver.time + 0.2)
+    wait(lambda: stuck.messages)
+    driver.close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,6 @@ from apex_ompl.robot import Robot
 pytest.importorskip("rclpy")
 
 client_of, stand_ins_of = benchmark_script("physics.ros2_client"), benchmark_script("physics.stand_ins")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _alone() -> Iterator[None]:
-    with client_of.alone():
-        yield
 
 
 def test_the_example_reaches_its_goal(robot: Robot, tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from apex_ompl import MotionPlanner, Obstacle, Problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.robot import Robot
+from apex_ompl.timing import time_path
 from apex_ompl.types import Array
 
 pytest.importorskip("rclpy")
@@ -34,19 +34,6 @@ from apex_ompl.ros2.node import ApexNode  # noqa: E402
 ALIKE = 1e-6  # of measured positions to a goal [rad]
 client_of, stand_ins_of = benchmark_script("physics.ros2_client"), benchmark_script("physics.stand_ins")
 BALL = Obstacle(name="ball", sphere={"radius": 0.06}, position=(2.0, 0.0, 1.0))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _alone() -> Iterator[None]:
-    with client_of.alone():
-        yield
-
-
-@pytest.fixture(scope="module")
-def stand_ins(robot: Robot, tmp_path_factory: Any) -> Iterator[Any]:
-    found = stand_ins_of.StandIns(robot, Path(tmp_path_factory.mktemp("stand_ins")))
-    yield found
-    found.close()
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +147,21 @@ def test_goals_of_joints_are_reached_and_told(robot: Robot, stand_ins: Any, clie
     assert {marker.ns for marker in client.wait(lambda: client.markers)} >= {"path", "goal", "world"}
 
 
+def test_a_robot_that_others_moved_goes_on_from_there(robot: Robot, stand_ins: Any, client: Any) -> None:
+    other, there = stand_ins.driver(), swung(robot, 0.4)
+    motion = time_path(np.stack([robot.home, there]), robot.limits, robot.joint_names).trajectory
+    other.send(motion, other.time + 0.2)
+    client.wait(lambda: np.abs(reached_state(robot, stand_ins) - there).max() <= ALIKE)
+    other.close()
+    time.sleep(0.3)
+    assert np.abs(reached_state(robot, stand_ins) - there).max() <= ALIKE  # the node does not pull it back
+    assert (
+        client.go("goal/joints", JointState(name=[stand_ins_of.PREFIX + "right_joint1"], position=[0.3])) == "reached"
+    )
+    there[robot.joint_names.index("right_joint1")] = 0.3
+    assert np.abs(reached_state(robot, stand_ins) - there).max() <= ALIKE
+
+
 def test_goals_as_poses_are_reached_in_their_frames(robot: Robot, stand_ins: Any, client: Any) -> None:
     hand = robot.hands["left_hand"]
     goal = PoseStamped(pose=Pose())
@@ -256,8 +258,9 @@ def test_a_motion_stops_before_what_comes_into_its_way(robot: Robot, stand_ins: 
 
 def test_a_new_goal_replaces_the_one_before(robot: Robot, stand_ins: Any, client: Any) -> None:
     count = len(client.outcomes)
-    client.publishers["goal/joints"].publish(joints(robot, swung(robot, 0.8)))
-    client.wait(lambda: abs(reached_state(robot, stand_ins)[0] - robot.home[0]) > 0.05)
+    with slow(client):
+        client.publishers["goal/joints"].publish(joints(robot, swung(robot, 0.8)))
+        client.wait(lambda: abs(reached_state(robot, stand_ins)[0] - robot.home[0]) > 0.05)
     client.publishers["goal/joints"].publish(joints(robot, swung(robot, -0.3)))
     assert client.wait(lambda: client.outcomes[count + 1 :]) == ["reached"]
     assert client.outcomes[count].startswith("replaced")

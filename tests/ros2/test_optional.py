@@ -8,7 +8,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,19 +45,6 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 from apex_ompl.ros2.node import ApexNode  # noqa: E402
 
 client_of, stand_ins_of = benchmark_script("physics.ros2_client"), benchmark_script("physics.stand_ins")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _alone() -> Iterator[None]:
-    with client_of.alone():
-        yield
-
-
-@pytest.fixture(scope="module")
-def stand_ins(robot: Robot, tmp_path_factory: Any) -> Iterator[Any]:
-    found = stand_ins_of.StandIns(robot, Path(tmp_path_factory.mktemp("stand_ins")))
-    yield found
-    found.close()
 
 
 @pytest.fixture(scope="module")

@@ -29,12 +29,6 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 client_of, stand_ins_of = benchmark_script("physics.ros2_client"), benchmark_script("physics.stand_ins")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _alone() -> Iterator[None]:
-    with client_of.alone():
-        yield
-
-
 @pytest.fixture
 def stand_ins(robot: Robot, tmp_path: Path) -> Iterator[Any]:
     found = stand_ins_of.StandIns(robot, tmp_path)
