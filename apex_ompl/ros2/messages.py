@@ -90,7 +90,9 @@ def joint_goal(message: Any, ours: Mapping[str, str]) -> dict[str, float]:
     Raises:
         ParameterError: A joint is unknown or comes twice, or its position is missing or not finite.
     """
-    if len(message.name) != len(message.position) or not message.name:
+    if not message.name:
+        raise ParameterError("goal", "no joints", "names and positions of joints")
+    if len(message.name) != len(message.position):
         raise ParameterError("goal", f"{len(message.position)} positions", f"one for each of {len(message.name)} names")
     found = dict[str, float]()
     for name, position in zip(message.name, message.position, strict=True):
