@@ -167,6 +167,7 @@ def main() -> None:
     ]
     lines += ["", "From a cloud and a goal to the first trajectory, through the node:", ""]
     lines += [record.row(some) for some in (head, ["---:"] * len(head), *rows)]
+    lines += ["", f"Of {args.clouds} goals each; without an answer are those that reached the node before their cloud."]
     data = followed | {"answers": answered}
     record.write("physics_ros2", data, "\n".join(lines), n=args.n, clouds=args.clouds, rclpy=version("ros-rclpy"))
 
