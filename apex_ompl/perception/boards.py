@@ -95,8 +95,8 @@ class Board(StrictModel):
             settings = cv2.aruco.DetectorParameters()
             settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
             corners, names, _ = cv2.aruco.ArucoDetector(markers, settings).detectMarkers(gray)
-            there = np.flatnonzero(np.ravel(names) == self.identity) if names is not None else ()
-            return np.asarray(corners[there[0]], float).reshape(4, 2) if len(there) == 1 else None
+            seen = [] if names is None else [k for k, one in enumerate(np.ravel(names)) if one == self.identity]
+            return np.asarray(corners[seen[0]], float).reshape(4, 2) if len(seen) == 1 else None
         size = (self.columns + 1, self.rows + 1)
         board = cv2.aruco.CharucoBoard(size, self.square, self.square * self.marker, markers)
         corners, names, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(gray)

@@ -183,7 +183,7 @@ class Camera(StrictModel):
         flat[..., 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
         flat *= np.asarray(self.focal)[:, None]
         depth = -(flat[..., 0] * x[..., None] + flat[..., 1] * y[..., None])
-        return np.concatenate([flat, depth[..., None]], axis=-1) / z[..., None, None]
+        return np.asarray(np.concatenate([flat, depth[..., None]], axis=-1) / z[..., None, None])
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Return the points of the plane z = 1 m of the optical frame that are seen at pixels.

@@ -159,7 +159,7 @@ def test_a_small_tag_needs_several_starts_and_gets_its_covariance(robot: Robot) 
 
 def test_derivatives_are_those_of_differences(robot: Robot) -> None:
     seen, names = views(robot, "board on the hand", count=4), ("left_joint2", "left_joint5")
-    fit = _Fit(robot, CAMERA, BOARD, seen, LINK, names)
+    fit = _Fit(robot, CAMERA, BOARD, seen, board_link=LINK, offsets=names)
     fit._x, fit._y = truth(robot, "board on the hand")[0].pose, truth(robot, "board on the hand")[1]
     at, step = np.random.default_rng(3).normal(0.0, 0.01, 14), 1e-6
     expected = [(fit._residuals(at + step * e) - fit._residuals(at - step * e)) / (2.0 * step) for e in np.eye(14)]
