@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from apex_ompl.errors import ApexError, ParameterError
-from apex_ompl.perception import Board, Calibration, Camera, View, calibrate, look_at
+from apex_ompl.perception import Board, Calibration, Camera, Frame, View, calibrate, look_at, save_sequence
 from apex_ompl.perception.hand_eye import _Fit
 from apex_ompl.robot import Robot
 
@@ -17,6 +18,7 @@ cv2: Any = pytest.importorskip("cv2")
 
 CAMERA = Camera(width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5))
 BOARD, TAG = Board(columns=9, rows=6), Board(kind="tag", square=0.06)
+LARGE = Board(columns=5, rows=4, square=0.06)
 LINK = "left_hand_palm"
 OFF = {"left_joint2": 0.004, "left_joint4": -0.003, "left_joint6": 0.002}
 CELL = 40  # pixels of a drawn square
@@ -195,3 +197,56 @@ def test_small_turns_are_refused(robot: Robot) -> None:
 def test_unknown_links_and_joints_are_refused(robot: Robot, options: dict[str, Any]) -> None:
     with pytest.raises(ApexError):
         calibrate(robot, CAMERA, BOARD, views(robot, "board on the hand", count=4), **options)
+
+
+def frames(robot: Robot, count: int = 8) -> list[Frame]:
+    """Return frames of the board on the hand, of an arm without offsets."""
+    off = OFF.copy()
+    OFF.clear()
+    try:
+        seen = views(robot, "board on the hand", LARGE, count=count)
+    finally:
+        OFF.update(off)
+    camera, board = truth(robot, "board on the hand")
+    depth, eye = np.zeros((480, 640)), np.linalg.inv(camera.pose)
+    return [
+        Frame(
+            CAMERA, depth, picture(LARGE, eye @ robot.link_pose(one.state, LINK) @ board), float(k),
+            dict(zip(robot.joint_names, one.state, strict=True)),
+        )
+        for k, one in enumerate(seen)
+    ]  # fmt: skip
+
+
+def test_frames_are_calibrated_by_the_command_line(robot: Robot, tmp_path: Path, apex_cli: Any) -> None:
+    blank = Frame(CAMERA, np.zeros((480, 640)), np.zeros((480, 640, 3), np.uint8), 100.0, frames(robot, 1)[0].joints)
+    save_sequence([*frames(robot), blank], tmp_path / "frames")
+    board = ("--board", "charuco:5x4:0.06")
+    done = apex_cli("calibrate", tmp_path / "frames", *board, "--board-link", LINK, "-o", tmp_path / "camera.yaml")
+    assert done.returncode == 0 and "8 of 9 frames" in done.stdout
+    found = Camera.load(tmp_path / "camera.yaml")
+    true, _ = truth(robot, "board on the hand")
+    assert np.linalg.norm(found.pose[:3, 3] - true.pose[:3, 3]) < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--board", "charuco:9x6"), "--board"),
+        (("--board", "poster:9x6:0.02"), "kind"),
+        (("--board", "chessboard:9x7:0.02"), "odd and an even"),
+        (("--board-link", "no_link"), "no_link"),
+        (("--board-link", LINK, "--offsets", "no_joint"), "no_joint"),
+        (("--board-link", LINK, "--camera", "none.yaml"), "none.yaml"),
+        (("--board-link", LINK, "--robot", "none"), "none"),
+        ((), "board_link"),
+        (("--board-link", LINK, "--board", "chessboard:9x6:0.03"), "0 of 4 show it"),
+    ],
+)
+def test_faulty_options_are_named(
+    robot: Robot, tmp_path: Path, apex_cli: Any, options: tuple[str, ...], named: str
+) -> None:
+    save_sequence(frames(robot, 4), tmp_path / "frames")
+    board = ("--board", "charuco:5x4:0.06")
+    done = apex_cli("calibrate", tmp_path / "frames", *board, *options, "-o", tmp_path / "camera.yaml")
+    assert done.returncode == 2 and named in done.stderr and not (tmp_path / "camera.yaml").exists()
