@@ -1,4 +1,4 @@
-"""Perception: from frames of a camera to objects in the hands, obstacles, and a task."""
+"""Perception: cameras, their calibration, and frames with color and depth."""
 
 from __future__ import annotations
 

@@ -79,6 +79,7 @@ def test_a_board_may_be_seen_in_part_or_not_at_all() -> None:
     [
         lambda: Board(kind="chessboard", columns=9, rows=7),
         lambda: BOARD.find(np.zeros((4, 4, 3))),
+        lambda: BOARD.find(np.zeros((0, 0, 3), np.uint8)),
         lambda: Board(dictionary="DICT_9X9").find(np.zeros((40, 40, 3), np.uint8)),
     ],
 )
@@ -172,6 +173,8 @@ def test_derivatives_are_those_of_differences(robot: Robot) -> None:
     ("change", "named"),
     [
         (lambda seen: seen[:3], "3 of 3"),
+        (lambda seen: None, "views"),
+        (lambda seen: [*seen, 1], "view 20"),
         (lambda seen: [View(one.state, one.pixels * np.nan) for one in seen], "0 of 20"),
         (lambda seen: [View(one.state[:5], one.pixels) for one in seen], "state of view 0"),
         (lambda seen: [View(one.state, one.pixels[:9]) for one in seen], "corners of view 0"),
