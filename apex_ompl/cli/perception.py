@@ -28,6 +28,7 @@ def calibrate(parsed: argparse.Namespace) -> int:
     for k, frame in enumerate(frames):
         if frame.color is None:
             raise FileFormatError(str(parsed.frames), f"frame {k}", None, "expected color images")
+        _check_image(given, frame.camera, k, intrinsics=parsed.camera is None)
         pixels = board.find(frame.color)
         if pixels is not None:
             views.append(View(frame.state(robot.joint_names), pixels))
@@ -49,6 +50,19 @@ def calibrate(parsed: argparse.Namespace) -> int:
     for name, value in found.offsets.items():
         print(f"  {name} reads {np.rad2deg(-value):+.3f} degrees, +- {np.rad2deg(found.offset_spreads[name]):.3f}")
     return 0
+
+
+def _check_image(camera: Camera, other: Camera, k: int, *, intrinsics: bool) -> None:
+    """Check that a frame is of a camera.
+
+    Raises:
+        ParameterError: Its image is of another size, or its intrinsics are others.
+    """
+    if (camera.width, camera.height) != (other.width, other.height):
+        size = f"{other.width} x {other.height} pixels"
+        raise ParameterError(f"frame {k}", size, f"{camera.width} x {camera.height}, the size of the camera's images")
+    if intrinsics and any(getattr(camera, name) != getattr(other, name) for name in ("focal", "center", "distortion")):
+        raise ParameterError(f"frame {k}", "another camera", "frames of one camera, or its file as --camera")
 
 
 def _numbers(values: Any) -> str:

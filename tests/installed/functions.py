@@ -20,7 +20,7 @@ import numpy as np
 
 MODULES = (
     "apex_ompl", "apex_ompl.ompl.space", "apex_ompl.planners", "apex_ompl.problems", "apex_ompl.robot",
-    "apex_ompl.planning", "apex_ompl.timing",
+    "apex_ompl.perception", "apex_ompl.planning", "apex_ompl.timing",
 )  # fmt: skip
 
 
@@ -38,6 +38,7 @@ def run(root: Path) -> list[str]:
         _use_steps()
         _use_run()
         _use_drivers()
+        _use_perception()
     (Path("tests")).symlink_to(root / "tests")  # data that a page reads
     for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
         code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(), re.S))
@@ -319,3 +320,32 @@ def _use_drivers() -> None:
     assert not whole.fault
     whole.close()
     assert FrankaSettings(rate=500.0).lead == 0.02
+
+
+def _use_perception() -> None:
+    """Calibration of a camera by corners as they would be found; docs/perception.md uses cameras and frames."""
+    import apex_ompl
+    from apex_ompl.perception import Board, Camera, DepthErrors, Frame, View, calibrate, load_frames, look_at
+
+    robot, board = apex_ompl.load_robot("panda"), Board(columns=5, rows=4, square=0.03)
+    camera = Camera(width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5), depth=DepthErrors(noise=0.003))
+    palm = robot.link_pose(robot.home, "panda_hand")
+    eye = look_at(palm[:3, 3] + [0.8, 0.3, 0.4], palm[:3, 3])
+    on_palm = np.linalg.inv(palm) @ np.block([[eye[:3, :3], palm[:3, 3:]], [np.zeros(3), 1.0]])
+    rng, views = np.random.default_rng(0), []
+    for _ in range(12):
+        q = robot.within_limits(robot.home + rng.normal(0.0, 0.3, robot.dof))
+        seen = np.linalg.inv(eye) @ robot.link_pose(q, "panda_hand") @ on_palm
+        points = board.corners @ seen[:3, :3].T + seen[:3, 3]
+        assert camera.projection_jacobian(points).shape == (20, 2, 3)
+        views.append(View(q, camera.project(points)))
+    found = calibrate(robot, camera, board, views, board_link="panda_hand")
+    assert np.abs(found.camera.pose_at(robot, robot.home) - eye).max() < 1e-3
+    assert found.corrected({"a": 1.0}) == {"a": 1.0}
+    assert board.find(np.full((480, 640, 3), 128, np.uint8)) is None
+    found.camera.save("found.yaml")
+    assert Camera.load("found.yaml") == found.camera and np.abs(camera.rays([319.5, 239.5])).max() < 1e-12
+    frame = Frame(camera, np.ones((480, 640)), joints=dict(zip(robot.joint_names, robot.home.tolist(), strict=True)))
+    frame.save("frame.npz")
+    assert np.array_equal(load_frames("frame.npz")[0].state(robot.joint_names), robot.home)
+    assert camera.points(Frame.load("frame.npz").depth).shape == (*camera.grid.shape[:2], 3)

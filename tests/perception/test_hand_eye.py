@@ -232,6 +232,15 @@ def test_frames_are_calibrated_by_the_command_line(robot: Robot, tmp_path: Path,
     assert np.linalg.norm(found.pose[:3, 3] - true.pose[:3, 3]) < 5e-3
 
 
+def test_frames_of_two_cameras_are_refused(robot: Robot, tmp_path: Path, apex_cli: Any) -> None:
+    seen = frames(robot, 4)
+    other = CAMERA.model_copy(update={"focal": (470.0, 470.0)})
+    save_sequence([*seen, Frame(other, seen[0].depth, seen[0].color, 9.0, seen[0].joints)], tmp_path / "frames")
+    options = ("--board", "charuco:5x4:0.06", "--board-link", LINK, "-o", tmp_path / "camera.yaml")
+    done = apex_cli("calibrate", tmp_path / "frames", *options)
+    assert done.returncode == 2 and "frame 4: expected frames of one camera" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("options", "named"),
     [
@@ -241,6 +250,7 @@ def test_frames_are_calibrated_by_the_command_line(robot: Robot, tmp_path: Path,
         (("--board-link", "no_link"), "no_link"),
         (("--board-link", LINK, "--offsets", "no_joint"), "no_joint"),
         (("--board-link", LINK, "--camera", "none.yaml"), "none.yaml"),
+        (("--board-link", LINK, "--camera", "small.yaml"), "320 x 240"),
         (("--board-link", LINK, "--robot", "none"), "none"),
         ((), "board_link"),
         (("--board-link", LINK, "--board", "chessboard:9x6:0.03"), "0 of 4 show it"),
@@ -250,6 +260,8 @@ def test_faulty_options_are_named(
     robot: Robot, tmp_path: Path, apex_cli: Any, options: tuple[str, ...], named: str
 ) -> None:
     save_sequence(frames(robot, 4), tmp_path / "frames")
+    Camera(width=320, height=240, focal=(232.0, 232.0), center=(159.5, 119.5)).save(tmp_path / "small.yaml")
+    options = tuple(str(tmp_path / option) if option == "small.yaml" else option for option in options)
     board = ("--board", "charuco:5x4:0.06")
     done = apex_cli("calibrate", tmp_path / "frames", *board, *options, "-o", tmp_path / "camera.yaml")
     assert done.returncode == 2 and named in done.stderr and not (tmp_path / "camera.yaml").exists()
