@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from apex_ompl.perception.hand_eye import Calibration as Calibration
     from apex_ompl.perception.hand_eye import View as View
     from apex_ompl.perception.hand_eye import calibrate as calibrate
+    from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
@@ -25,5 +26,6 @@ __all__, __getattr__, __dir__ = lazy_names(
         "camera": "Camera DepthErrors look_at",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
+        "twin_camera": "TwinCamera",
     },  # fmt: skip
 )
