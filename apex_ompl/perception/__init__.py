@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from apex_ompl.perception.bags import bag_frames as bag_frames
     from apex_ompl.perception.boards import Board as Board
     from apex_ompl.perception.camera import Camera as Camera
     from apex_ompl.perception.camera import DepthErrors as DepthErrors
@@ -17,15 +18,18 @@ if TYPE_CHECKING:
     from apex_ompl.perception.hand_eye import Calibration as Calibration
     from apex_ompl.perception.hand_eye import View as View
     from apex_ompl.perception.hand_eye import calibrate as calibrate
+    from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
     from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "bags": "bag_frames",
         "boards": "Board",
         "camera": "Camera DepthErrors look_at",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
+        "synchronizer": "Synchronizer",
         "twin_camera": "TwinCamera",
     },  # fmt: skip
 )
