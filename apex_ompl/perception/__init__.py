@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from apex_ompl.perception.hand_eye import Calibration as Calibration
     from apex_ompl.perception.hand_eye import View as View
     from apex_ompl.perception.hand_eye import calibrate as calibrate
+    from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
     from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
     from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
@@ -29,6 +30,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "camera": "Camera DepthErrors look_at",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
+        "ros2_camera": "Ros2Camera",
         "synchronizer": "Synchronizer",
         "twin_camera": "TwinCamera",
     },  # fmt: skip

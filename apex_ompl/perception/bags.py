@@ -15,14 +15,15 @@ from apex_ompl.perception.synchronizer import TOLERANCE, Synchronizer
 from apex_ompl.util.files import path_text
 
 ROLE = "bag of ROS 2"
-IMAGE, INFO, STATES = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"
+COLOR, ALIGNED = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
+INFO, STATES = "/camera/camera/color/camera_info", "/joint_states"
+"""Topics of a RealSense camera with depths aligned to colors, and of joint states."""
+IMAGE_TYPE, INFO_TYPE, STATES_TYPE = (f"sensor_msgs/msg/{name}" for name in ("Image", "CameraInfo", "JointState"))
 
 
 def bag_frames(
-    path: str | PathLike[str], camera: Camera | None = None, *,
-    color: str | None = "/camera/camera/color/image_raw",
-    depth: str | None = "/camera/camera/aligned_depth_to_color/image_raw",
-    info: str | None = "/camera/camera/color/camera_info", states: str | None = "/joint_states",
+    path: str | PathLike[str], camera: Camera | None = None, *, color: str | None = COLOR,
+    depth: str | None = ALIGNED, info: str | None = INFO, states: str | None = STATES,
     renamed: Mapping[str, str] | None = None, tolerance: float = TOLERANCE, rectified: bool = False,
 ) -> Iterator[Frame]:  # fmt: skip
     """Yield the frames of a bag (SQLite or MCAP), in order.
@@ -54,8 +55,10 @@ def bag_frames(
         camera, color=color is not None, depth=depth is not None, states=states is not None, renamed=renamed,
         tolerance=tolerance, rectified=rectified,
     )  # fmt: skip
-    kinds = [(color, IMAGE, together.color), (depth, IMAGE, together.depth), (states, STATES, together.states)]
-    kinds += [(info, INFO, together.info)] if camera is None else []
+    kinds = [
+        (color, IMAGE_TYPE, together.color), (depth, IMAGE_TYPE, together.depth),
+        (states, STATES_TYPE, together.states), (info if camera is None else None, INFO_TYPE, together.info),
+    ]  # fmt: skip
     takes = {topic: (kind, take) for topic, kind, take in kinds if topic is not None}
     if len(takes) < sum(topic is not None for topic, _, _ in kinds):
         raise ParameterError("topics", list(takes), "another topic for each kind of message")

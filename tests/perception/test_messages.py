@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,51 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from images import CAMERA, START, Ros, Rosbags, image, info, states, store
 
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.perception import Camera, Frame, Synchronizer, bag_frames, load_frames, look_at, save_sequence
+from apex_ompl.perception.bags import ALIGNED, COLOR, INFO, STATES
 from apex_ompl.perception.messages import camera_of, color_image, depth_image
 
 pytest.importorskip("rosbags")
 
 from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: E402 - after the check
-from rosbags.typesys import Stores, get_typestore  # noqa: E402
-
-STORE = get_typestore(Stores.ROS2_JAZZY)
-CAMERA = Camera(width=6, height=4, focal=(5.0, 5.1), center=(2.5, 1.5), distortion=(0.01, -0.02, 0.001, 0.002, 0.003))
-START = 1_700_000_000_000_000_000  # [ns]
-COLOR, DEPTH = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
-INFO, STATES = "/camera/camera/color/camera_info", "/joint_states"
-
-
-class Rosbags:
-    """Messages of rosbags."""
-
-    def message(self, kind: str, **fields: Any) -> Any:
-        return STORE.types[kind.replace("/", "/msg/")](**fields)
-
-    def stamped(self, kind: str, ns: int, **fields: Any) -> Any:
-        stamp = self.message("builtin_interfaces/Time", sec=ns // 10**9, nanosec=ns % 10**9)
-        return self.message(kind, header=self.message("std_msgs/Header", stamp=stamp, frame_id="camera"), **fields)
-
-    def region(self, **fields: Any) -> Any:
-        zero = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
-        return self.message("sensor_msgs/RegionOfInterest", **zero | fields)
-
-
-class Ros(Rosbags):
-    """Messages of a ROS 2."""
-
-    def message(self, kind: str, **fields: Any) -> Any:
-        module, name = kind.split("/")
-        found = getattr(import_module(f"{module}.msg"), name)()
-        for field, value in fields.items():
-            listed = isinstance(value, np.ndarray) and field != "data"
-            if field == "data":
-                found.data.frombytes(np.asarray(value).tobytes())
-            else:
-                setattr(found, field, value.tolist() if listed else value)
-        return found
 
 
 def sources() -> list[Any]:
@@ -62,43 +26,11 @@ def sources() -> list[Any]:
     return [pytest.param(Rosbags(), id="rosbags"), pytest.param(Ros(), id="ros", marks=missing)]
 
 
-def image(
-    source: Rosbags, pixels: np.ndarray, encoding: str, ns: int = START, *, padding: int = 0, big: bool = False
-) -> Any:
-    """Return a message of an image, shape (height, width) or with channels, whose rows are padded by some bytes."""
-    height, width = pixels.shape[:2]
-    ordered = pixels.astype(pixels.dtype.newbyteorder(">" if big else "<"))
-    rows = np.ascontiguousarray(ordered).reshape(height, -1).view(np.uint8)
-    rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=77)
-    return source.stamped(
-        "sensor_msgs/Image", ns, height=height, width=width, encoding=encoding, is_bigendian=int(big),
-        step=rows.shape[1], data=rows.ravel(),
-    )  # fmt: skip
-
-
 def empty(source: Rosbags) -> Any:
     """Return a message of an image without rows."""
     found = image(source, np.zeros((1, 6), np.uint16), "16UC1")
     found.height = 0
     return found
-
-
-def info(source: Rosbags, camera: Camera = CAMERA, **changes: Any) -> Any:
-    fx, fy, cx, cy = *camera.focal, *camera.center
-    fields = {
-        "height": camera.height, "width": camera.width, "distortion_model": "plumb_bob",
-        "d": np.array(camera.distortion), "k": np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-        "r": np.eye(3).ravel(), "p": np.array([4.8, 0.0, 2.4, 0.0, 0.0, 4.9, 1.4, 0.0, 0.0, 0.0, 1.0, 0.0]),
-        "binning_x": 0, "binning_y": 0, "roi": source.region(),
-    }  # fmt: skip
-    return source.stamped("sensor_msgs/CameraInfo", START, **fields | changes)
-
-
-def states(source: Rosbags, ns: int, **joints: float) -> Any:
-    positions = np.array(list(joints.values()))
-    return source.stamped(
-        "sensor_msgs/JointState", ns, name=list(joints), position=positions, velocity=np.zeros(0), effort=np.zeros(0)
-    )
 
 
 @pytest.mark.parametrize("padding", [0, 6])
@@ -217,16 +149,16 @@ def test_images_without_states_or_depths(tmp_path: Path) -> None:
 
 def write_bag(folder: Path, *, plugin: StoragePlugin, count: int = 5, **parts: bool) -> None:
     """Write a bag of a camera at 10 Hz and joint states at 50 Hz."""
-    source, kinds = Rosbags(), {COLOR: "Image", DEPTH: "Image", INFO: "CameraInfo", STATES: "JointState"}
+    source, kinds = Rosbags(), {COLOR: "Image", ALIGNED: "Image", INFO: "CameraInfo", STATES: "JointState"}
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         links = {
-            topic: writer.add_connection(topic, f"sensor_msgs/msg/{kind}", typestore=STORE)
+            topic: writer.add_connection(topic, f"sensor_msgs/msg/{kind}", typestore=store())
             for topic, kind in kinds.items()
         }
 
         def write(topic: str, message: Any, ns: int) -> None:
             kind = f"sensor_msgs/msg/{kinds[topic]}"
-            writer.write(links[topic], ns, STORE.serialize_cdr(message, kind))
+            writer.write(links[topic], ns, store().serialize_cdr(message, kind))
 
         for tick in range(5 * count):
             ns = START + tick * 20_000_000
@@ -236,7 +168,7 @@ def write_bag(folder: Path, *, plugin: StoragePlugin, count: int = 5, **parts: b
                 at = ns + 5_000_000
                 if parts.get("info", True):
                     write(INFO, info(source), at)
-                write(DEPTH, image(source, depth, "16UC1", at), at)
+                write(ALIGNED, image(source, depth, "16UC1", at), at)
                 write(COLOR, image(source, color, "rgb8", at), at)
 
 
