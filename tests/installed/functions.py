@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -44,7 +45,8 @@ def run(root: Path) -> list[str]:
         code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(), re.S))
         with _traced(called, made), redirect_stdout(io.StringIO()):
             exec(compile(code, page.name, "exec"), {"__name__": "__page__"})
-    return [name for name, code, kind in _public() if code not in called and not any(issubclass(m, kind) for m in made)]
+    public = [one for one in _public() if find_spec("sensor_msgs") or "Ros2Camera" not in one[0]]
+    return [name for name, code, kind in public if code not in called and not any(issubclass(m, kind) for m in made)]
 
 
 @contextmanager
@@ -349,3 +351,56 @@ def _use_perception() -> None:
     frame.save("frame.npz")
     assert np.array_equal(load_frames("frame.npz")[0].state(robot.joint_names), robot.home)
     assert camera.points(Frame.load("frame.npz").depth).shape == (*camera.grid.shape[:2], 3)
+    _use_messages(camera)
+    _use_twin_camera(camera.placed(eye))
+
+
+def _use_messages(camera: Any) -> None:
+    """Messages that have the fields of those of ROS 2, and a bag without images."""
+    from types import SimpleNamespace as Message
+
+    from apex_ompl.errors import DriverError, MissingFileError, UnknownNameError
+    from apex_ompl.perception import Ros2Camera, Synchronizer, bag_frames
+
+    header = Message(stamp=Message(sec=1, nanosec=0))
+    image = {"header": header, "height": 480, "width": 640, "is_bigendian": 0}
+    together = Synchronizer()
+    together.states(Message(header=header, name=["a"], position=[0.5]))
+    together.color(Message(**image, encoding="mono8", step=640, data=bytes(640 * 480)))
+    together.depth(Message(**image, encoding="16UC1", step=1280, data=bytes(2 * 640 * 480)))
+    whole = Message(x_offset=0, y_offset=0)
+    matrix = [465.0, 0.0, 319.5, 0.0, 465.0, 239.5, 0.0, 0.0, 1.0]
+    about = Message(height=480, width=640, distortion_model="", d=[], k=matrix, roi=whole, binning_x=0, binning_y=0)
+    together.info(about)
+    (frame,) = together.ready()
+    assert frame.camera.focal == camera.focal and frame.joints == {"a": 0.5}
+    try:
+        next(bag_frames("bag"))
+    except UnknownNameError as error:
+        assert "/joint_states" in str(error)
+    node = Message(create_subscription=lambda *given: given, destroy_subscription=lambda one: None)
+    try:
+        over_ros = Ros2Camera(node, camera)
+    except MissingFileError:
+        return
+    assert not over_ros.frames() and not over_ros.dropped
+    try:
+        over_ros.next(0.01)
+    except DriverError as error:
+        assert "no images" in str(error)
+    over_ros.close()
+
+
+def _use_twin_camera(camera: Any) -> None:
+    """A camera in physics, where there is OpenGL."""
+    import apex_ompl
+    from apex_ompl.drivers import MujocoDriver
+    from apex_ompl.errors import MissingFileError
+    from apex_ompl.perception import TwinCamera
+
+    twin_camera = TwinCamera(MujocoDriver(apex_ompl.load_robot("panda")), camera)
+    try:
+        assert twin_camera.frame().depth.any() and len(list(twin_camera.frames(0.1, 10.0))) == 2
+    except MissingFileError as error:
+        assert "OpenGL" in str(error) and twin_camera.frames(0.1, 10.0)
+    twin_camera.close()
