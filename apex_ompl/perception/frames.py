@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.camera import Camera, check_camera
 from apex_ompl.scene.points import depth_in_meters
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
@@ -55,8 +55,7 @@ class Frame:
             ApexError: An image has another size than the camera's, depths are negative or of another unit, or a number
                 is not finite.
         """
-        if not isinstance(self.camera, Camera):
-            raise ParameterError("camera", self.camera, "a Camera")
+        check_camera(self.camera)
         if not isinstance(self.joints, Mapping):
             raise ParameterError("joints", self.joints, "positions by the names of joints")
         shape = (self.camera.height, self.camera.width)

@@ -14,6 +14,7 @@ from apex_ompl.perception.bags import ALIGNED, COLOR, INFO, STATES
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.synchronizer import TOLERANCE, Synchronizer
+from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_integer, check_positive
 
 NEEDED = {"sensor_msgs.msg": ("CameraInfo", "Image", "JointState"), "rclpy.qos": ("qos_profile_sensor_data",)}
@@ -70,6 +71,10 @@ class Ros2Camera:
                                      ros.qos_profile_sensor_data)
             for topic, kind, take in wanted if topic is not None
         ]  # fmt: skip
+
+    def __repr__(self) -> str:
+        """Return the camera, and how many images were left out."""
+        return one_line("Ros2Camera", repr(self._together))
 
     @property
     def dropped(self) -> dict[str, int]:

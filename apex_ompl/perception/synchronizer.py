@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.camera import Camera, check_camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.messages import camera_of, color_image, depth_image
 from apex_ompl.timing.files import NANOSECONDS
+from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_positive
 
 TOLERANCE = 0.02  # between stamps of what belongs together [s]
@@ -46,18 +47,29 @@ class Synchronizer:
             rectified: Whether images are rectified, for intrinsics (:func:`apex_ompl.perception.messages.camera_of`).
 
         Raises:
-            ParameterError: The tolerance is not positive, or there are neither colors nor depths.
+            ParameterError: The tolerance is not positive, there are neither colors nor depths, or another argument is
+                faulty.
         """
         check_positive(tolerance, "tolerance", "a positive number of seconds")
+        if camera is not None:
+            check_camera(camera)
+        given = {} if renamed is None else renamed
+        if not isinstance(given, Mapping) or len({*given.values()}) < len(given):
+            raise ParameterError("renamed", renamed, "names of joints in ROS by ours, each once")
         if not (color or depth):
             raise ParameterError("color", color, "colors, depths, or both")
         self.camera, self.dropped = camera, Counter[str]()
         self._rectified, self._tolerance = rectified, round(tolerance * NANOSECONDS)
-        self._ours = {theirs: name for name, theirs in (renamed or {}).items()}
+        self._ours = {theirs: name for name, theirs in given.items()}
         self._mains, self._colors = deque[tuple[int, NDArray[Any]]](), deque[tuple[int, NDArray[Any]]]()
         self._with_depth, self._paired, self._with_states = depth, depth and color, states
         self._states = dict[str, deque[tuple[int, float]]]()
         self._last = -1
+
+    def __repr__(self) -> str:
+        """Return the camera, and how many images were left out."""
+        name = "no camera yet" if self.camera is None else self.camera.name
+        return one_line("Synchronizer", name, *(f"{reason}: {count}" for reason, count in self.dropped.items()))
 
     def info(self, message: Any) -> None:
         """Take a ``sensor_msgs/CameraInfo``, unless there is a camera.

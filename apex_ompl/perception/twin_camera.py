@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import MissingFileError, ParameterError
-from apex_ompl.perception.camera import LARGEST_IMAGE, Camera
+from apex_ompl.perception.camera import LARGEST_IMAGE, Camera, check_camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.types import Array, Indices
-from apex_ompl.util.validation import check_array, check_number, check_positive
+from apex_ompl.util.display import one_line
+from apex_ompl.util.validation import check_number, check_positive
 
 BACKGROUND = 0.999  # share of the distance of the far plane from which on nothing is seen
 HINT = "install libegl1 or libosmesa6, and set MUJOCO_GL to egl or osmesa"
@@ -46,14 +47,20 @@ class TwinCamera:
             camera: The camera as it is; its link is one of the robot's.
             reported: The camera that frames name, of the same size, by default the same one: with another pose it is
                 one that was moved since its calibration.
-            measured: Function from exact depths, shape (height, width) [m], 0 where there is none, to measured ones; by
-                default they are exact.
+            measured: Function from exact depths, shape (height, width) [m], 0 where there is none, to measured ones, as
+                floats [m] or whole numbers [mm]; by default they are exact.
 
         Raises:
-            ApexError: The robot has no such link, the other camera has another size, or the distortion needs an image
-                that is too large.
+            ApexError: The robot has no such link, the other camera has another size, the distortion needs an image that
+                is too large, or an argument is of another kind.
         """
-        self.driver, self.camera, self.reported = driver, camera, reported or camera
+        if not isinstance(driver, MujocoDriver):
+            raise ParameterError("driver", driver, "a MujocoDriver")
+        check_camera(camera)
+        self.driver, self.camera, self.reported = driver, camera, camera if reported is None else reported
+        check_camera(self.reported, "reported")
+        if not (measured is None or callable(measured)):
+            raise ParameterError("measured", measured, "a function of depths")
         if (self.reported.width, self.reported.height) != (camera.width, camera.height):
             size = f"{self.reported.width} x {self.reported.height}"
             raise ParameterError("reported", size, f"a camera of {camera.width} x {camera.height} pixels")
@@ -63,6 +70,10 @@ class TwinCamera:
         self._sampling = _Sampling.of(camera)
         self._renderers: list[Any] = []
 
+    def __repr__(self) -> str:
+        """Return the camera and the robot."""
+        return one_line("TwinCamera", self.camera.name, self.driver.robot.name)
+
     def frame(self) -> Frame:
         """Return what the camera sees now, with the time on the driver's clock and the measured positions of joints.
 
@@ -70,7 +81,7 @@ class TwinCamera:
 
         Raises:
             MissingFileError: There is no OpenGL.
-            ParameterError: The driver was closed, or measured depths have another shape.
+            ParameterError: The driver was closed, or measured depths have another shape or unit.
         """
         driver, state = self.driver, self.driver.state()
         twin = driver.twin
@@ -84,8 +95,7 @@ class TwinCamera:
         true[(true < errors.nearest) | (true > errors.farthest)] = 0.0
         seen = true / errors.scale
         if self._measured is not None:
-            seen = np.asarray(self._measured(seen), float)
-            check_array(seen, true.shape, "measured depths")
+            seen = self._measured(seen)
         joints = dict(zip(driver.names, state.positions.tolist(), strict=True))
         return Frame(self.reported, seen, self._sampling.colors(self._drawn(drawing, pose)), state.stamp, joints)
 

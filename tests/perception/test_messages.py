@@ -91,6 +91,8 @@ def test_intrinsics_are_those_of_the_message(source: Rosbags) -> None:
         (lambda s: camera_of(info(s, k=np.array([5.0, 0.0, 99.0, 0.0, 5.0, 2.0, 0.0, 0.0, 1.0]))), "principal point"),
         (lambda s: Synchronizer(color=False, depth=False), "colors, depths, or both"),
         (lambda s: Synchronizer(tolerance=-1.0), "tolerance"),
+        (lambda s: Synchronizer(CAMERA.pose), "a Camera"),
+        (lambda s: Synchronizer(renamed={"a": "x", "b": "x"}), "renamed"),
     ],
 )
 @pytest.mark.parametrize("source", sources())

@@ -119,6 +119,8 @@ def test_depths_are_reported_as_a_camera_measures_them(driver: MujocoDriver) -> 
     frame = TwinCamera(driver, short, reported=moved, measured=lambda z: np.where(z > 0.0, z + 0.003, 0.0)).frame()
     kept = (exact.depth >= 0.9) & (exact.depth <= 1.2)
     assert kept.any() and frame.camera == moved
+    whole = TwinCamera(driver, short, measured=lambda z: np.round(1e3 * z).astype(np.uint16)).frame()
+    np.testing.assert_allclose(whole.depth, np.where(kept, exact.depth / 1.01, 0.0), atol=0.51e-3)
     np.testing.assert_allclose(frame.depth, np.where(kept, exact.depth / 1.01 + 0.003, 0.0), atol=1e-9)
 
 
@@ -153,7 +155,10 @@ def test_frames_at_a_rate_are_a_sequence(robot: Robot, tmp_path: Path, driver: M
     [
         (lambda d: TwinCamera(d, CAMERA.model_copy(update={"link": "no_link"})), "no_link"),
         (lambda d: TwinCamera(d, CAMERA, reported=CAMERA.model_copy(update={"width": 80})), "80 x 120"),
-        (lambda d: TwinCamera(d, CAMERA, measured=lambda z: z[:3]).frame(), "measured depths"),
+        (lambda d: TwinCamera(d, CAMERA, measured=lambda z: z[:3]).frame(), "depth"),
+        (lambda d: TwinCamera(d, CAMERA, measured=3), "measured"),  # type: ignore[arg-type]
+        (lambda d: TwinCamera(d.robot, CAMERA), "a MujocoDriver"),
+        (lambda d: TwinCamera(d, CAMERA.pose), "a Camera"),
         (lambda d: next(TwinCamera(d, CAMERA).frames(0.1, 0.0)), "rate"),
         (lambda d: next(TwinCamera(d, CAMERA).frames(-0.1, 10.0)), "until"),
         (lambda d: next(TwinCamera(d, CAMERA).frames(float("nan"), 10.0)), "until"),
