@@ -31,10 +31,16 @@ class Driver(Protocol):
     Attributes:
         names: Names of the joints, in the order of states.
         limits: Limits of the joints, which each motion must keep.
+        time: Time on the driver's clock [s].
     """
 
     names: tuple[str, ...]
     limits: Limits
+
+    @property
+    def time(self) -> float:
+        """Time on the driver's clock [s]."""
+        ...
 
     def state(self) -> DriverState:
         """Return the measured state."""

@@ -68,3 +68,15 @@ class ObservationSource(Protocol):
 
     def observations(self, until: float) -> Iterable[Observation]:
         """Return the observations with stamps up to a time [s] that were not returned before, in order of stamp."""
+
+
+class LiveSensor(Protocol):
+    """A sensor of one's own."""
+
+    def read(self, now: float) -> Observation | None:
+        """Return what it saw since the last call, or None; called once in each period.
+
+        Args:
+            now: Time on the clock of the run [s]: the driver's, or the time since the start of the run. Stamps are of
+                that clock.
+        """

@@ -94,7 +94,6 @@ class Loop:
             PlannerProcessError: The planner process did not become ready.
         """
         check_seed(seed)
-        check_number(tolerance, "tolerance", 0.0, math.pi)
         if not isinstance(problem, Problem):
             raise ParameterError("problem", problem, "a Problem, as apex_ompl.load_problem returns it")
         if not isinstance(settings, LoopSettings):
@@ -116,12 +115,24 @@ class Loop:
                 replanner = replanning.make()
                 replanner.prepare(context)
         answers: Replanning = self._process or ImmediateReplanning(context, replanner)
-        self.settings, self.joint_names, self._tolerance = context.settings, context.names, tolerance
-        self._control = Control(context, answers, seed, awaited=awaited, lead=used.period)
-        self._before = Decided.of(self._control.executor)
+        self._begin(Control(context, answers, seed, awaited=awaited, lead=used.period), tolerance)
+
+    @classmethod
+    def around(cls, control: Control, tolerance: float = TOLERANCE) -> Loop:
+        """Return the loop by steps of a control whose lead is a period; its planner is the caller's to end."""
+        loop = cls.__new__(cls)
+        loop._process = None
+        loop._begin(control, tolerance)
+        return loop
+
+    def _begin(self, control: Control, tolerance: float) -> None:
+        check_number(tolerance, "tolerance", 0.0, math.pi)
+        self.settings, self.joint_names, self._tolerance = control.context.settings, control.context.names, tolerance
+        self._control = control
+        self._before = Decided.of(control.executor)
         self._waiting: list[Observation] = []
         self._zero: float | None = None
-        self._now, self._next, self._known = -math.inf, 0, 0.0
+        self._now, self._next, self._known = -math.inf, 0, -math.inf
         self._record: RunRecord | None = None
 
     def __repr__(self) -> str:
@@ -192,7 +203,7 @@ class Loop:
         """Let the robot come to rest and end the run for a reason; may be called from any thread."""
         self._control.abort(why)
 
-    def step(self, now: float, state: Array | None = None) -> Command | None:
+    def step(self, now: float, state: Array | None = None, stamp: float | None = None) -> Command | None:
         """Decide what the robot does, and return it; None where nothing new was decided.
 
         That is so in a period that was decided before, when the run is over, and where the clock went back, which ends
@@ -203,17 +214,20 @@ class Loop:
             state: The measured positions of the joints, shape (dof,), or None where they are not known now. Where a
                 joint is further than the tolerance from where it should be, and where no state was usable for
                 ``settings.silence``, the robot stops and the run ends.
+            stamp: When they were measured [s], by default now. One that does not increase is not usable.
 
         Raises:
-            ParameterError: The time is not finite.
+            ParameterError: A time is not finite.
         """
         check_number(now, "now")
+        if stamp is not None:
+            check_number(stamp, "stamp")
         if self._record is not None:
             return None
         self._zero = now if self._zero is None else self._zero
         elapsed = now - self._zero
         if elapsed < self._now - SAME_TIME:
-            self._end(f"the clock went back by {self._now - elapsed:.3g} s")
+            self.end(f"the clock went back by {self._now - elapsed:.3g} s")
             return None
         self._now = elapsed
         period, executor = self.settings.period, self._control.executor
@@ -222,14 +236,18 @@ class Loop:
             return None
         if k > self._next:  # periods passed without a step, in which the robot follows the proved stop
             undo(executor, (self._next + 1) * period, Decided.of(executor))
-        self._compare(elapsed, state)
+        self._compare(elapsed, state, elapsed if stamp is None else min(stamp - self._zero, elapsed))
         for observation in self._waiting:
             since = observation.stamp - self._zero
             self._control.take(replace(observation, stamp=since, received=since), elapsed)
         self._waiting.clear()
         self._before, self._next, then = Decided.of(executor), k + 1, (k + 1) * period
-        with quiet_ompl():
-            self._record = self._control.decide(then, self._control.predicted(then))
+        try:
+            with quiet_ompl():
+                self._record = self._control.step(then)
+        except BaseException:  # Ctrl-C among them: the robot follows what it was sent before
+            undo(executor, then, self._before)
+            raise
         return self._command(then)
 
     def missed(self) -> Command | None:
@@ -251,20 +269,27 @@ class Loop:
         motion = one.piece(then, max(one.end, then))
         return Command((self._zero or 0.0) + then, motion, one.to_goal)
 
-    def _compare(self, now: float, state: Array | None) -> None:
-        """Stop where the robot is not where it should be, or where that was not known for too long."""
-        wanted = self._control.executor.state(now)
-        if state is not None and np.shape(state) == wanted.shape and np.isfinite(state).all():
-            self._known = now
+    def _compare(self, now: float, state: Array | None, stamp: float) -> None:
+        """Stop where the robot is not where it should be, or where that was not known for too long.
+
+        Args:
+            now: Time of the loop [s].
+            state: The measured positions, shape (dof,), or None.
+            stamp: When they were measured [s].
+        """
+        wanted = self._control.executor.state_then(stamp)
+        usable = state is not None and np.shape(state) == wanted.shape and bool(np.isfinite(state).all())
+        if usable and stamp > self._known:
+            self._known = stamp
             off = np.abs(np.asarray(state) - wanted)
             k = int(off.argmax())
             if off[k] > self._tolerance:
                 self.abort(f"{self.joint_names[k]} is {off[k]:.3g} rad from where it should be")
-        elif state is not None and now - self._known > self.settings.silence:
+        elif state is not None and now - max(self._known, 0.0) > self.settings.silence:
             self.abort(f"no state of the robot was usable for {self.settings.silence:g} s")
 
-    def _end(self, why: str) -> None:
-        """End the run at once: the robot follows the last command to its end."""
+    def end(self, why: str) -> None:
+        """End the run at once for a reason: the robot follows the last command to its end."""
         control, then = self._control, (self._next + 1) * self.settings.period
         control.abort(why)
         undo(control.executor, then, Decided.of(control.executor))
