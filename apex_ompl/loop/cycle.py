@@ -88,6 +88,6 @@ def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float) -> boo
     """Whether an obstacle violates the assumptions of the guarantee: unseen, or outside its reachable set."""
     for o in present:
         known = [track for track in (*tracker.tracks.values(), *tracker.doubted) if track.shape.name == o.name]
-        if not any(tracker.may_be(track, o, now, errors=1) for track in known):
+        if not any(tracker.may_be(track, o, now) for track in known):
             return True
     return False

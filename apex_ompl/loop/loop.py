@@ -7,12 +7,13 @@ at rest: a robot that gets no further command comes to rest along it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.clocks import cores, warm_up
@@ -23,16 +24,20 @@ from apex_ompl.loop.replan.methods import method_of
 from apex_ompl.loop.replanning import ImmediateReplanning, PlannerProcess, Replanning
 from apex_ompl.loop.result import Event, Outcome
 from apex_ompl.moving.context import SAME_TIME, Following
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.replanner import Replanner
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
+from apex_ompl.planning.world import CloudFiles
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line, one_line
+from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_number, check_seed, number_array
 
+POINT_RADIUS = 0.01  # of the balls around the points of a cloud [m]
 TOLERANCE = 0.05  # largest distance of a joint from where it should be [rad]
 OUTCOMES = {"stuck": Outcome.STUCK, "timeout": Outcome.TIMEOUT, "aborted": Outcome.ABORTED}
 
@@ -131,6 +136,7 @@ class Loop:
         self._control = control
         self._before = Decided.of(control.executor)
         self._waiting: list[Observation] = []
+        self._clouds = CloudFiles()
         self._zero: float | None = None
         self._now, self._next, self._known = -math.inf, 0, -math.inf
         self._record: RunRecord | None = None
@@ -178,26 +184,68 @@ class Loop:
         zero = self._zero or 0.0
         return tuple(replace(event, time=zero + event.time) for event in self._control.executor.events)
 
-    def observe(self, stamp: float, objects: Iterable[Obstacle]) -> None:
+    def observe(
+        self, stamp: float, objects: Iterable[Obstacle] = (), *, errors: Mapping[str, ArrayLike] | None = None,
+        clouds: Mapping[str, ArrayLike] | None = None, radius: float = POINT_RADIUS,
+    ) -> None:  # fmt: skip
         """Take an observation of obstacles that move, or may.
 
         One that cannot be true (a place that is not finite, a stamp in the future) is refused as a whole at the next
         step, and an event says so; the robot stops where no observation was usable for ``settings.silence``.
 
+        A cloud replaces the last one of its name, as a whole. Its points are not tracked: each may move at
+        ``settings.fastest`` from where it was seen. So between two clouds the robot keeps clear of balls around all
+        points, which grow. Call this from another thread where clouds are large: a cloud of 50 000 points takes 60 ms.
+
         Args:
             stamp: When they were where they were seen, on the caller's clock [s].
             objects: The obstacles with their shapes where they were seen, by name, without velocities. A known obstacle
                 that is missing here was not seen, which tells nothing about where it is.
+            errors: Errors of their positions by name, in place of ``settings.error``: largest distances [m], or
+                covariances, shape (3, 3) [m^2], of which three standard deviations along the longest axis count.
+            clouds: Points that a depth camera saw, by the name of the camera, shape (N, 3) [m], as large as
+                obstacles: each point of an obstacle that may touch the robot before the next cloud is within
+                ``radius`` and ``settings.error`` of one. Without points, nothing is there.
+            radius: Radius of the balls around the points of clouds [m].
 
         Raises:
-            ParameterError: The stamp is no number, or an object is no Obstacle.
+            ParameterError: The stamp is no number, an object is no Obstacle, or a cloud has another shape.
+            FileFormatError: The radius is not positive.
         """
         seen = tuple(objects)
         for one in seen:
             if not isinstance(one, Obstacle):
                 raise ParameterError("objects", one, "obstacles")
         at = float(number_array(stamp, "stamp", "a number"))
-        self._waiting.append(Observation(at, at, seen))
+        found = {name: self._cloud(name, points, radius) for name, points in (clouds or {}).items()}
+        bodies = tuple(body for body in found.values() if body is not None)
+        gone = tuple(name for name, body in found.items() if body is None)
+        self._waiting.append(Observation(at, at, (*seen, *bodies), dict(errors or {}), gone))
+
+    def _cloud(self, name: str, points: ArrayLike, radius: float) -> Obstacle | None:
+        """Return the obstacle of a cloud, in the files that a planner process reads; None without points.
+
+        Where a point is not finite its position is not either, so that the observation is refused.
+        """
+        cloud = number_array(points, "clouds", "points")
+        if cloud.ndim != 2 or cloud.shape[1] != 3:
+            raise ParameterError("clouds", cloud.shape, f"an array of shape (N, 3) for {name}")
+        if not len(cloud):
+            return None
+        path = self._clouds.path(None)
+        body = validate(Obstacle, {"name": name, "points": {"file": str(path), "radius": radius}}, "cloud")
+        if not np.isfinite(cloud).all():
+            return body.model_copy(update={"position": (math.nan,) * 3})
+        self._clouds.write(cloud, path, self._cloud_files())
+        DynamicObstacles([body])  # whose grid of distances is kept
+        return body
+
+    def _cloud_files(self) -> set[str]:
+        """Return the files of clouds that are tracked or wait."""
+        tracker = self._control.tracker
+        known = [track.shape for track in (*tracker.tracks.values(), *tracker.doubted)]
+        known += [one for observation in self._waiting for one in observation.seen]
+        return {one.points.file for one in known if one.points is not None}
 
     def abort(self, why: str) -> None:
         """Let the robot come to rest and end the run for a reason; may be called from any thread."""
@@ -237,10 +285,10 @@ class Loop:
         if k > self._next:  # periods passed without a step, in which the robot follows the proved stop
             undo(executor, (self._next + 1) * period, Decided.of(executor))
         self._compare(elapsed, state, elapsed if stamp is None else min(stamp - self._zero, elapsed))
-        for observation in self._waiting:
+        waiting, self._waiting = self._waiting, []
+        for observation in waiting:
             since = observation.stamp - self._zero
             self._control.take(replace(observation, stamp=since, received=since), elapsed)
-        self._waiting.clear()
         self._before, self._next, then = Decided.of(executor), k + 1, (k + 1) * period
         try:
             with quiet_ompl():
