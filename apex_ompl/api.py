@@ -150,7 +150,7 @@ def run(
     speed: float = 1.0,
     settings: LoopSettings | None = None,
     sensor: Sensor | LiveSensor | None = None,
-    driver: Driver | None = None,
+    driver: Driver | str | None = None,
     tolerance: float = 0.05,
 ) -> RunResult:
     """Let a robot go to a goal while obstacles move.
@@ -172,8 +172,9 @@ def run(
             default those of the modeled sensor and the environment; for a sensor of your own they are required.
         sensor: How obstacles are observed: the model of a sensor, or one of your own, an object with ``read(now)``
             (:class:`apex_ompl.loop.environment.LiveSensor`).
-        driver: The robot, at rest at the start (:class:`apex_ompl.drivers.driver.Driver`); by default one that is
-            exactly where it is commanded to be. With ``clock="sim"`` the driver's clock is advanced.
+        driver: The robot, at rest at the start (:class:`apex_ompl.drivers.driver.Driver`), or a name: ``mujoco``, one
+            in physics, or ``kinematic``. With ``clock="sim"`` its clock is advanced. By default the robot is exactly
+            where it is commanded to be, and each step decides what it does from then on, not from the next step on.
         tolerance: Largest distance of a measured joint from where it should be, beyond which the robot stops and the
             run ends [rad].
 

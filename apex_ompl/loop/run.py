@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
 from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -11,6 +12,8 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.drivers.driver import Driver
+from apex_ompl.drivers.kinematic import KinematicDriver
+from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.clocks import cores, run_in_real_time, simulate, undisturbed, warm_up
 from apex_ompl.loop.control import RunRecord
@@ -30,19 +33,21 @@ from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import Replanner
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.model import Robot, digest
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.util.validation import check_name, check_number, check_seed
 
+DRIVERS = ("kinematic", "mujoco")
+"""Names of drivers that can be made for a problem."""
 CLOCKS = SIMULATED, REAL = "sim", "real"
 
 
 def run_in(
     environment: Environment, method: str | Replanner = "apex", *, clock: str = "sim", prediction: str = "cv",
     seed: int = 0, speed: float = 1.0, settings: LoopSettings | None = None,
-    sensor: Sensor | LiveSensor | None = None, driver: Driver | None = None, tolerance: float = TOLERANCE,
+    sensor: Sensor | LiveSensor | None = None, driver: Driver | str | None = None, tolerance: float = TOLERANCE,
 ) -> RunResult:  # fmt: skip
     """Let a robot go to a goal in an environment whose obstacles move; see :func:`apex_ompl.run` for the arguments.
 
@@ -50,6 +55,8 @@ def run_in(
         ApexError: The environment was used before, or the problem, a name or a number is unknown or faulty.
     """
     check_name(clock, "clock", CLOCKS)
+    if isinstance(driver, str):
+        check_name(driver, "driver", DRIVERS)
     check_seed(seed)
     if settings is not None and not isinstance(settings, LoopSettings):
         raise ParameterError("settings", settings, "a LoopSettings")
@@ -65,7 +72,9 @@ def run_in(
         seed_ompl(seed)
         context = context_of(environment.problem, used, speed, seed)
         setup = context.setup
-        if driver is not None:
+        if isinstance(driver, str):
+            driver = named_driver(driver, environment.problem, setup.robot, clock)
+        elif driver is not None:
             check_driver(driver, setup.robot, simulated=clock == SIMULATED)
         noted = {"loop": asdict(used), "sensor": _noted(sensor), "speed": speed, "costs": cost_table()["version"]}
         noted |= {} if driver is None else {"driver": type(driver).__name__}
@@ -108,6 +117,24 @@ def _completed(settings: LoopSettings, sensor: Sensor | LiveSensor, environment:
     if missing:
         raise ParameterError("settings", f"no {' and no '.join(missing)}", "both, for a sensor of one's own")
     return settings
+
+
+def named_driver(name: str, problem: Problem, robot: Robot, clock: str) -> Driver:
+    """Return a driver at the start of a problem: ``kinematic`` or ``mujoco``.
+
+    Obstacles that move are not in its physics: the referee finds what the robot touches.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        ParameterError: Physics on the wall clock.
+        MissingFileError: The extra ``twin`` is not installed.
+    """
+    start = problem.start_state(robot.joint_names)
+    if check_name(name, "driver", DRIVERS) == "kinematic":
+        return KinematicDriver(robot, start, clock=None if clock == SIMULATED else time.monotonic)
+    if clock != SIMULATED:
+        raise ParameterError("driver", name, "the simulated clock, on which physics is")
+    return MujocoDriver(robot, problem.still, state=start)
 
 
 def _noted(sensor: Sensor | LiveSensor) -> dict[str, Any]:
