@@ -174,7 +174,7 @@ def run(
             (:class:`apex_ompl.loop.environment.LiveSensor`).
         driver: The robot, at rest at the start (:class:`apex_ompl.drivers.driver.Driver`), or a name: ``mujoco``, one
             in physics, or ``kinematic``. With ``clock="sim"`` its clock is advanced. By default the robot is exactly
-            where it is commanded to be, and each step decides what it does from then on, not from the next step on.
+            where it is commanded to be, and a step decides what it does at once, not from the next step on.
         tolerance: Largest distance of a measured joint from where it should be, beyond which the robot stops and the
             run ends [rad].
 

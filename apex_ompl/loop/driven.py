@@ -96,14 +96,14 @@ class DrivenRun:
 
     def __post_init__(self) -> None:
         """Set up the loop by steps."""
-        self.loop, self._last = Loop.around(self.cycle, self.tolerance), -math.inf
+        self.loop, self._last = Loop.around(self.cycle, self.tolerance, self.zero), -math.inf
 
     def run(self) -> RunRecord:
         """Run until the robot is at rest at a goal, or the run ends otherwise.
 
         Returns:
             The record. ``measured`` has the distances of the measured from the commanded positions, of the joint that
-            is farthest off [rad], and the number of commands that came too late.
+            is farthest off [rad], and the number of commands that did not reach the driver.
         """
         period, before, still = self.cycle.context.settings.period, -math.inf, 0
         with running(self.cycle.abort):
@@ -144,6 +144,10 @@ class DrivenRun:
     def _step(self) -> None:
         """Make the step of the present period."""
         now = self.driver.time
+        if not math.isfinite(now):
+            self.loop.end(f"the time of the driver is {now}")
+            self._last = max(self._last, 0.0)
+            return
         elapsed = now - self.zero
         positions, stamp = self._measured(elapsed)
         if elapsed >= self._last - SAME_TIME:
@@ -176,15 +180,14 @@ class DrivenRun:
                 self.cycle.executor.log(max(elapsed, self._last, 0.0), "driver fault", what=fault)
             self._fault = fault
             return None, math.nan
-        positions = np.asarray(state.positions, float)
-        usable = positions.shape == (len(self.driver.names),) and np.isfinite(positions).all()
-        self._sample(state.stamp - self.zero, positions)
-        return (positions if usable else None), state.stamp
-
-    def _sample(self, time: float, positions: Array) -> None:
-        if np.isfinite(positions).all() and (not self.times or time > self.times[-1] + SAME_TIME):
-            self.times.append(time)
+        positions, stamp = np.asarray(state.positions, float), float(state.stamp)
+        if positions.shape != (len(self.driver.names),) or not np.isfinite([*positions, stamp]).all():
+            return None, math.nan
+        since = stamp - self.zero
+        if not self.times or since > self.times[-1] + SAME_TIME:
+            self.times.append(since)
             self.positions.append(positions)
+        return positions, stamp
 
     def _send(self, command: Command) -> bool:
         """Send a command to the driver, and return whether it came in time; a driver that refuses it ends the run."""

@@ -123,11 +123,18 @@ class Loop:
         self._begin(Control(context, answers, seed, awaited=awaited, lead=used.period), tolerance)
 
     @classmethod
-    def around(cls, control: Control, tolerance: float = TOLERANCE) -> Loop:
-        """Return the loop by steps of a control whose lead is a period; its planner is the caller's to end."""
+    def around(cls, control: Control, tolerance: float, zero: float) -> Loop:
+        """Return the loop by steps of a control whose lead is a period; its planner is the caller's to end.
+
+        Args:
+            control: The control.
+            tolerance: Largest distance of a joint from where it should be, at which the robot is still followed [rad].
+            zero: Time on the caller's clock at which the control's starts [s].
+        """
         loop = cls.__new__(cls)
         loop._process = None
         loop._begin(control, tolerance)
+        loop._zero = zero
         return loop
 
     def _begin(self, control: Control, tolerance: float) -> None:

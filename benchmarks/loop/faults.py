@@ -20,7 +20,7 @@ from apex_ompl.errors import DriverError
 from apex_ompl.loop import Observation, Outcome, RunResult
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems.suite_robot import robot
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
@@ -30,7 +30,7 @@ DEPENDS = ("@planning", "apex_ompl/moving", "apex_ompl/loop", "apex_ompl/timing"
 PROBLEM, SPEED, SEED = "vertical/free/800001", 0.2, 0
 START = 0.6  # time of a fault [s]
 SETTINGS = LoopSettings(error=0.01, fastest=0.3, silence=0.4, timeout=6.0)
-BALL = Obstacle(name="ball", sphere={"radius": 0.05}, position=(1.5, 1.5, 1.0))
+BALL = Obstacle(name="ball", sphere=Sphere(radius=0.05), position=(1.5, 1.5, 1.0))
 NOWHERE = BALL.model_copy(update={"position": (float("nan"),) * 3})
 REST = 1e-3  # largest velocity of a joint at rest [rad/s]
 JUMP, BACK, DELAY, PUSH, PUSHED = 0.1, 0.3, 0.02, 400.0, 0.02  # [rad], [s], [s], [Nm], [s]
@@ -77,7 +77,7 @@ class FaultyDriver:
 
     def state(self) -> DriverState:
         """Return the measured state."""
-        found = self.inner.state()
+        found: DriverState = self.inner.state()
         if not self.failing:
             self._last = found
         elif self.fault == "silent":
@@ -149,7 +149,7 @@ def tried(fault: str, kind: str) -> tuple[RunResult, FaultyDriver]:
 
 
 def rest_after(driver: FaultyDriver) -> tuple[float, bool]:
-    """Return how long after its fault a robot was at rest for 20 ms first [s], and whether it was from then on."""
+    """Return how long after its fault a robot was at rest for 20 ms first [s], and whether it stayed there."""
     late = np.array([one for one in driver.speeds if one[0] >= START])
     still = late[:, 1] <= REST
     starts = [k for k in range(len(late)) if still[k : np.searchsorted(late[:, 0], late[k, 0] + 0.02)].all()]

@@ -68,8 +68,8 @@ def test_the_same_seed_gives_the_same_run_on_a_driver() -> None:
 
 def test_a_driver_on_the_wall_clock_is_followed() -> None:
     driver = KinematicDriver(robot(), exact().state().positions, clock=time.monotonic)
-    found = run(problems.load(PROBLEM), "no-network", clock="real", settings=replace(SETTINGS, timeout=5.0),
-                sensor=Camera(), driver=driver)  # fmt: skip
+    limits = replace(SETTINGS, timeout=5.0, silence=60.0)
+    found = run(problems.load(PROBLEM), "no-network", clock="real", settings=limits, sensor=Camera(), driver=driver)
     assert found.outcome in (Outcome.REACHED, Outcome.TIMEOUT) and found.clock == "real"
     assert np.abs(driver.state().velocities).max() == 0.0
     assert np.abs(driver.state().positions - found.trajectory.positions[-1]).max() < 1e-9
