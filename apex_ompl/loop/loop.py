@@ -267,8 +267,8 @@ class Loop:
         Args:
             now: Time on the caller's clock [s]; it starts at the first step.
             state: The measured positions of the joints, shape (dof,), or None where they are not known now. Where a
-                joint is further than the tolerance from where it should be, and where no state was usable for
-                ``settings.silence``, the robot stops and the run ends.
+                joint is further than the tolerance from where it should be, and, once there was a state, where none was
+                usable for ``settings.silence``, the robot stops and the run ends.
             stamp: When they were measured [s], by default now. One that does not increase is not usable.
 
         Raises:
@@ -340,7 +340,7 @@ class Loop:
             k = int(off.argmax())
             if off[k] > self._tolerance:
                 self.abort(f"{self.joint_names[k]} is {off[k]:.3g} rad from where it should be")
-        elif state is not None and now - max(self._known, 0.0) > self.settings.silence:
+        elif (state is not None or self._known > -math.inf) and now - max(self._known, 0.0) > self.settings.silence:
             self.abort(f"no state of the robot was usable for {self.settings.silence:g} s")
 
     def end(self, why: str) -> None:
