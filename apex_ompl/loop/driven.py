@@ -40,10 +40,11 @@ def check_driver(driver: Any, robot: Robot, *, simulated: bool) -> None:
     Raises:
         ParameterError: It is none, or of other joints, or its clock is not simulated where it is to be.
     """
-    wanted = ("state", "send", "stop", "close", *(["advance"] if simulated else []))
-    if not all(callable(getattr(driver, name, None)) for name in wanted) or not hasattr(driver, "time"):
+    attributes, methods = ("names", "time", "end", "fault"), ("state", "send", *(["advance"] if simulated else []))
+    known = all(hasattr(driver, name) for name in attributes)
+    if not known or not all(callable(getattr(driver, name, None)) for name in methods):
         also = ", and advance, or clock='real'" if simulated else ""
-        raise ParameterError("driver", driver, f"a driver with time, state, send, stop and close{also}")
+        raise ParameterError("driver", driver, f"a driver with names, time, end, fault, state and send{also}")
     if tuple(driver.names) != robot.joint_names:
         raise ParameterError("driver", ", ".join(driver.names), f"the joints of {robot.name}")
 
@@ -91,8 +92,8 @@ class DrivenRun:
     times: list[float] = field(default_factory=list)
     positions: list[Array] = field(default_factory=list)
     _late: int = 0
-    _sent: float = 0.0
-    _fault: str = ""
+    _unheard: float | None = None  # since when commands do not reach the driver [s]
+    _silent: bool = False
 
     def __post_init__(self) -> None:
         """Set up the loop by steps."""
@@ -154,6 +155,8 @@ class DrivenRun:
             self.cycle.advance(elapsed, positions)
             self.cycle.observe(elapsed)
         self._last = max(elapsed, self._last)
+        if self.driver.fault:
+            self.cycle.abort(self.driver.fault)
         command = self.loop.step(now, np.full(len(self.driver.names), np.nan) if positions is None else positions,
                                  now if positions is None else stamp)  # fmt: skip
         if command is None:
@@ -166,8 +169,7 @@ class DrivenRun:
                 self.loop.missed()
         self.cycle.announce_start(command.at - self.zero)
         silence = self.cycle.context.settings.silence
-        self._sent = elapsed if sent else self._sent
-        if elapsed - self._sent > silence:
+        if self._unheard is not None and elapsed - self._unheard > silence:
             self.cycle.abort(LATE.format(silence))
 
     def _measured(self, elapsed: float) -> tuple[Array | None, float]:
@@ -175,11 +177,12 @@ class DrivenRun:
         try:
             state = self.driver.state()
         except Exception as error:  # whatever a driver raises, the robot stops where that lasts
-            fault = f"{type(error).__name__}: {error}"
-            if type(error).__name__ not in self._fault:
-                self.cycle.executor.log(max(elapsed, self._last, 0.0), "driver fault", what=fault)
-            self._fault = fault
+            if not self._silent:
+                what = f"{type(error).__name__}: {error}"
+                self.cycle.executor.log(max(elapsed, self._last, 0.0), "driver fault", what=what)
+            self._silent = True
             return None, math.nan
+        self._silent = False
         positions, stamp = np.asarray(state.positions, float), float(state.stamp)
         if positions.shape != (len(self.driver.names),) or not np.isfinite([*positions, stamp]).all():
             return None, math.nan
@@ -191,13 +194,17 @@ class DrivenRun:
 
     def _send(self, command: Command) -> bool:
         """Send a command to the driver, and return whether it came in time; a driver that refuses it ends the run."""
+        if command.rests and self.driver.end <= command.at:
+            return True  # it rests there anyway
         try:
             self.driver.send(command.motion, command.at)
         except Exception as error:  # whatever a driver raises, the robot follows the stop that it was sent before
             if self.driver.time <= command.at:
                 self.cycle.abort(f"the driver refused a motion, {type(error).__name__}: {error}")
             self._late += 1
+            self._unheard = command.at - self.zero if self._unheard is None else self._unheard
             return False
+        self._unheard = None
         return True
 
     def _wait(self, until: float) -> None:

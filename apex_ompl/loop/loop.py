@@ -216,9 +216,13 @@ class Loop:
             radius: Radius of the balls around the points of clouds [m].
 
         Raises:
-            ParameterError: The stamp is no number, an object is no Obstacle, or a cloud has another shape.
+            ParameterError: The stamp is no number, an object is no Obstacle, errors or clouds are not given by name, or
+                a cloud has another shape.
             FileFormatError: The radius is not positive.
         """
+        for name, given in (("errors", errors), ("clouds", clouds)):
+            if not isinstance(given, Mapping | None):
+                raise ParameterError(name, given, "a mapping by names")
         seen = tuple(objects)
         for one in seen:
             if not isinstance(one, Obstacle):

@@ -179,9 +179,7 @@ class _Run:
             robot_digest=digest(robot),
         )  # fmt: skip
 
-    def driven(
-        self, driver: Driver, answers: Replanning, sensor: Sensor | LiveSensor, tolerance: float
-    ) -> RunResult:  # fmt: skip
+    def driven(self, driver: Driver, answers: Replanning, sensor: Sensor | LiveSensor, tolerance: float) -> RunResult:
         """Run on a driver's clock, and return the result."""
         context, simulated = self.context, self.clock == SIMULATED
         with nullcontext() if simulated else undisturbed(cores()[0]):
@@ -198,8 +196,8 @@ class _Run:
         """Return the result with the referee's report, on the measured motion where there is one."""
         dynamic = [o.name for o in self.environment.script()]
         report = judge(
-            self.context.setup.robot, self.problem(), measured or done.trajectory, goals=self.context.goals,
-            dynamic=dynamic, commanded=measured and done.trajectory,
+            self.context.setup.robot, self.problem(), done.trajectory if measured is None else measured,
+            goals=self.context.goals, dynamic=dynamic, commanded=None if measured is None else done.trajectory,
         )  # fmt: skip
         outcome, reason = report.outcome, "; ".join(report.faults)
         if outcome is None:

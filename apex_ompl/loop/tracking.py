@@ -237,7 +237,7 @@ class Tracker:
             if seen.half_space is not None:
                 return f"{seen.name} has no bounds"
         for name, error in observation.errors.items():
-            fault = error_fault(error) if name in names else "has no obstacle"
+            fault = error_fault(error) if name in (*names, *observation.gone) else "has no obstacle"
             if fault:
                 return f"the error of {name} {fault}"
         if len({*names}) < len(names):

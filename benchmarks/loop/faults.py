@@ -51,12 +51,12 @@ class FaultyDriver:
 
     Attributes:
         inner: The driver.
-        fault: One of ``FAULTS``.
+        failure: One of ``FAULTS``.
         speeds: Times [s], and true velocities of the fastest joint [rad/s].
     """
 
     inner: Any
-    fault: str
+    failure: str
     speeds: list[tuple[float, float]] = field(default_factory=list)
     _last: DriverState | None = None
     _failed: bool = False
@@ -73,35 +73,45 @@ class FaultyDriver:
     @property
     def time(self) -> float:
         """Time on the driver's clock [s]."""
-        return float(self.inner.time - (BACK if self.fault == "clock" and self.failing else 0.0))
+        return float(self.inner.time - (BACK if self.failure == "clock" and self.failing else 0.0))
+
+    @property
+    def end(self) -> float:
+        """Time from which on rest is commanded [s]."""
+        return float(self.inner.end)
+
+    @property
+    def fault(self) -> str:
+        """Why the driver stopped, in a sentence; else empty."""
+        return str(self.inner.fault)
 
     def state(self) -> DriverState:
         """Return the measured state."""
         found: DriverState = self.inner.state()
         if not self.failing:
             self._last = found
-        elif self.fault == "silent":
+        elif self.failure == "silent":
             raise DriverError("there were no joint states")
-        elif self.fault == "frozen":
+        elif self.failure == "frozen":
             assert self._last is not None
             return self._last
-        elif self.fault == "jumps":
+        elif self.failure == "jumps":
             return replace(found, positions=found.positions + JUMP * (np.arange(len(self.names)) == 3))
         return replace(found, stamp=self.time)
 
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on."""
-        if self.failing and (self.fault == "late" or (self.fault == "late once" and not self._failed)):
+        if self.failing and (self.failure == "late" or (self.failure == "late once" and not self._failed)):
             self._failed = True
             self.advance(at + DELAY)
-        if self.failing and self.fault == "refuses":
+        if self.failing and self.failure == "refuses":
             raise DriverError("the controller is not active")
         self.inner.send(motion, at)
 
     def advance(self, until: float) -> None:
         """Let the clock go on to a time [s]."""
         self.inner.advance(until + (self.inner.time - self.time))
-        if self.fault == "pushed" and isinstance(self.inner, MujocoDriver):
+        if self.failure == "pushed" and isinstance(self.inner, MujocoDriver):
             pushed = START <= self.inner.time < START + PUSHED
             self.inner.data.qfrc_applied[self.inner.twin.v[3]] = PUSH if pushed else 0.0
         self.speeds.append((self.inner.time, float(np.abs(self.inner.state().velocities).max())))
@@ -109,6 +119,11 @@ class FaultyDriver:
     def stop(self) -> None:
         """Come to rest."""
         self.inner.stop()
+
+    def recover(self) -> Array:
+        """Take up motions again."""
+        found: Array = self.inner.recover()
+        return found
 
     def close(self) -> None:
         """Release the driver."""
@@ -119,16 +134,16 @@ class FaultyDriver:
 class FaultyCamera:
     """A camera that sees a ball that stays far away, 50 times a second, and fails from a time on."""
 
-    fault: str
+    failure: str
     count: int = 0
 
     def read(self, now: float) -> Observation | None:
         """Return what it sees, or None."""
         self.count += 1
         failing = now >= START - 1e-9
-        if self.count % 2 or (self.fault == "camera" and failing and now < START + 1.0):
+        if self.count % 2 or (self.failure == "camera" and failing and now < START + 1.0):
             return None
-        bad = failing and (self.fault == "nan only" or (self.fault == "nan" and self.count % 4 == 0))
+        bad = failing and (self.failure == "nan only" or (self.failure == "nan" and self.count % 4 == 0))
         return Observation(now, now, (NOWHERE if bad else BALL,))
 
 
