@@ -7,6 +7,8 @@ at rest: a robot that gets no further command comes to rest along it.
 from __future__ import annotations
 
 import math
+import threading
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from types import TracebackType
@@ -142,8 +144,8 @@ class Loop:
         self.settings, self.joint_names, self._tolerance = control.context.settings, control.context.names, tolerance
         self._control = control
         self._before = Decided.of(control.executor)
-        self._waiting: list[Observation] = []
-        self._clouds = CloudFiles()
+        self._waiting = deque[Observation]()
+        self._clouds, self._observing = CloudFiles(), threading.Lock()
         self._zero: float | None = None
         self._now, self._next, self._known = -math.inf, 0, -math.inf
         self._record: RunRecord | None = None
@@ -195,14 +197,15 @@ class Loop:
         self, stamp: float, objects: Iterable[Obstacle] = (), *, errors: Mapping[str, ArrayLike] | None = None,
         clouds: Mapping[str, ArrayLike] | None = None, radius: float = POINT_RADIUS,
     ) -> None:  # fmt: skip
-        """Take an observation of obstacles that move, or may.
+        """Take an observation of obstacles that move, or may; may be called from any thread.
 
         One that cannot be true (a place that is not finite, a stamp in the future) is refused as a whole at the next
         step, and an event says so; the robot stops where no observation was usable for ``settings.silence``.
 
         A cloud replaces the last one of its name, as a whole. Its points are not tracked: each may move at
         ``settings.fastest`` from where it was seen. So between two clouds the robot keeps clear of balls around all
-        points, which grow. Call this from another thread where clouds are large: a cloud of 50 000 points takes 60 ms.
+        points, which grow, and which are never forgotten. A cloud of 50 000 points takes 60 ms: where that is much of a
+        period, call this from a thread of its own.
 
         Args:
             stamp: When they were where they were seen, on the caller's clock [s].
@@ -228,10 +231,11 @@ class Loop:
             if not isinstance(one, Obstacle):
                 raise ParameterError("objects", one, "obstacles")
         at = float(number_array(stamp, "stamp", "a number"))
-        found = {name: self._cloud(name, points, radius) for name, points in (clouds or {}).items()}
-        bodies = tuple(body for body in found.values() if body is not None)
-        gone = tuple(name for name, body in found.items() if body is None)
-        self._waiting.append(Observation(at, at, (*seen, *bodies), dict(errors or {}), gone))
+        with self._observing:
+            found = {name: self._cloud(name, points, radius) for name, points in (clouds or {}).items()}
+            bodies = tuple(body for body in found.values() if body is not None)
+            gone = tuple(name for name, body in found.items() if body is None)
+            self._waiting.append(Observation(at, at, (*seen, *bodies), dict(errors or {}), gone))
 
     def _cloud(self, name: str, points: ArrayLike, radius: float) -> Obstacle | None:
         """Return the obstacle of a cloud, in the files that a planner process reads; None without points.
@@ -255,7 +259,7 @@ class Loop:
         """Return the files of clouds that are tracked or wait."""
         tracker = self._control.tracker
         known = [track.shape for track in (*tracker.tracks.values(), *tracker.doubted)]
-        known += [one for observation in self._waiting for one in observation.seen]
+        known += [one for observation in tuple(self._waiting) for one in observation.seen]
         return {one.points.file for one in known if one.points is not None}
 
     def abort(self, why: str) -> None:
@@ -296,8 +300,8 @@ class Loop:
         if k > self._next:  # periods passed without a step, in which the robot follows the proved stop
             undo(executor, (self._next + 1) * period, Decided.of(executor))
         self._compare(elapsed, state, elapsed if stamp is None else min(stamp - self._zero, elapsed))
-        waiting, self._waiting = self._waiting, []
-        for observation in waiting:
+        while self._waiting:
+            observation = self._waiting.popleft()
             since = observation.stamp - self._zero
             self._control.take(replace(observation, stamp=since, received=since), elapsed)
         self._before, self._next, then = Decided.of(executor), k + 1, (k + 1) * period

@@ -285,14 +285,16 @@ class Tracker:
                 self.doubted = [track for track in self.doubted if track.shape.name != name]
 
     def _forget(self, seen: set[str], watched: float) -> None:
-        """Forget obstacles that were not seen for ``memory``.
+        """Forget obstacles that were not seen for ``memory``; those of points stay until they are ``gone``.
+
+        A cloud is all that a camera saw, so that one that is not followed by another tells that the camera is silent.
 
         Args:
             seen: Names of those that were seen now.
             watched: Time since the last observation [s].
         """
         for track in (*self.tracks.values(), *self.doubted):
-            track.unseen += watched if track.shape.name not in seen else 0.0
+            track.unseen += watched if track.shape.name not in seen and track.shape.points is None else 0.0
         self.tracks = {name: track for name, track in self.tracks.items() if track.unseen <= self.memory}
         self.doubted = [track for track in self.doubted if track.unseen <= self.memory]
 

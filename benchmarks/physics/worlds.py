@@ -8,9 +8,11 @@ fails where it does not end at rest at a goal within 10 s. Obstacles are not in 
 Differences of the failure ratio are paired by worlds, with intervals of Agresti and Min (2005), and p is that of
 McNemar's exact test.
 
-Runs are stored in benchmarks/runs/physics_worlds, a file for each world; the command resumes where it was stopped.
+Runs are stored in benchmarks/runs/physics_worlds, a file for each world; the command resumes where it was stopped. The
+results are those of the worlds that each of the drivers has run in.
 
-Usage: python -m benchmarks.physics.worlds [-n 60] [--split test] [--kinds moving popup] [--report]
+Usage: python -m benchmarks.physics.worlds [-n 60] [--split test] [--kinds moving popup] [--drivers exact physics]
+    [--report]
 """
 
 from __future__ import annotations
@@ -130,34 +132,38 @@ def main() -> None:
     parser = record.parser(__doc__ or "", n=60, of="worlds of a kind")
     parser.add_argument("--split", default="test", choices=("test", "validation"))
     parser.add_argument("--kinds", nargs="+", default=list(worlds.kinds()), choices=worlds.kinds())
+    parser.add_argument("--drivers", nargs="+", default=list(DRIVERS), choices=DRIVERS)
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     given = parser.parse_args()
     each = {kind: worlds.ids(kind, given.split, given.n) for kind in given.kinds}
     names = [name for some in zip(*each.values(), strict=True) for name in some]  # all kinds grow alike
     files = {name: FOLDER / f"{name.replace('/', '_')}.json" for name in names}
     FOLDER.mkdir(parents=True, exist_ok=True)
-    missing = [name for name in names if not files[name].exists()]
-    for name in tqdm([] if given.report else missing):
-        stored = {driver: made(name, driver) for driver in DRIVERS} | {"commit": record.session()["commit"]}
-        write_atomically(files[name], json.dumps(stored, indent=1).encode())
     runs = {name: json.loads(file.read_text()) for name, file in files.items() if file.exists()}
+    missing = [name for name in names if not {*given.drivers} <= runs.get(name, {}).keys()]
+    for name in tqdm([] if given.report else missing):
+        stored = runs.setdefault(name, {"commit": record.session()["commit"]})
+        stored |= {driver: made(name, driver) for driver in given.drivers if driver not in stored}
+        write_atomically(files[name], json.dumps(stored, indent=1).encode())
+    runs = {name: one for name, one in runs.items() if {*given.drivers} <= one.keys()}
     here = {kind: [name for name in some if name in runs] for kind, some in each.items()}
     here["all"] = list(runs)
-    rows = [row(kind, driver, [runs[n][driver] for n in some]) for kind, some in here.items() for driver in DRIVERS]
-    beside = [
-        paired(driver, [(failed(runs[n][EXACT]), failed(runs[n][driver])) for n in runs])
-        for driver in (PHYSICS, LOADED)
+    rows = [
+        row(kind, driver, [runs[n][driver] for n in some]) for kind, some in here.items() for driver in given.drivers
     ]
-    touched = [sum(bool(one[driver]["contacts"]) for one in runs.values()) for driver in (PHYSICS, LOADED)]
+    physical = [driver for driver in given.drivers if driver != EXACT]
+    beside = [
+        paired(driver, [(failed(one[EXACT]), failed(one[driver])) for one in runs.values()])
+        for driver in (physical if EXACT in given.drivers else [])
+    ]
+    touched = {driver: sum(bool(one[driver]["contacts"]) for one in runs.values()) for driver in physical}
     tables = [[HEAD, *rows], [PAIRED, *beside]]
     text = "\n\n".join(
         "\n".join(record.row(list(line)) for line in (head, ["---", *["---:"] * (len(head) - 1)], *lines))
         for head, *lines in tables
     )
-    text += (
-        f"\n\nRuns in which the robot touched itself or a static obstacle in physics: {touched[0]} and, with the "
-        f"unknown load, {touched[1]}.\n"
-    )
+    counts = ", ".join(f"{count} ({driver})" for driver, count in touched.items())
+    text += f"\n\nRuns in which the robot touched itself or a static obstacle in physics: {counts or '-'}.\n"
     data = {"columns": HEAD, "rows": rows, "paired_columns": PAIRED, "paired": beside, "touched": touched}
     commits = "; ".join(sorted({one["commit"] for one in runs.values()}))
     settings = {"split": given.split, "n": len(runs), "seed": SEED, "mujoco": mujoco().__version__}
