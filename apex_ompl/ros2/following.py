@@ -193,19 +193,20 @@ class Follower:
         self.scene.remove_observed()
         problem = planner.problem(self._start(), target, "goal")
         recent = self._nanoseconds(driver.time - settings.loop.memory)
-        awaited = [name for name, (stamp, _) in self.scene.observed.items() if stamp >= recent]
         self._live = self.inbox.clouds_come(recent)
         if self._live:  # then the cloud does not stand
             problem = problem.model_copy(update={"scene": tuple(o for o in problem.scene if o.name != CLOUD)})
-            awaited.append(CLOUD)
         with Loop(
             problem, settings.method, settings=settings.loop, speed=settings.speed, seed=settings.seed,
-            tolerance=settings.tolerance, awaited=awaited,
+            tolerance=settings.tolerance,
         ) as loop, self._clouds(loop):  # fmt: skip
             while driver.time < driver.end:
                 time.sleep(LOOK)
             self.tell("following the closed loop")
-            self.scene.observations(self.state_at)  # those from before the first step are of no use to it
+            self.scene.observations(self.state_at)
+            for stamp, obstacle in self.scene.observed.values():
+                if stamp >= recent:
+                    loop.observe(float(driver.times_of(stamp)), [obstacle])
             while loop.outcome is None:
                 self._step(loop)
                 time.sleep(TICK)
@@ -253,13 +254,14 @@ class Follower:
                 self.scene.place_cloud()
 
     def _observe_clouds(self, loop: Loop, over: threading.Event) -> None:
+        scene, comes = self.scene, True  # the last cloud before the loop is its first
         try:
             while not over.is_set():
+                if comes:
+                    at = float(self.driver.times_of(scene.cloud_stamp))
+                    loop.observe(at, clouds={CLOUD: scene.cloud}, radius=scene.radius)
                 self.inbox.wait_for_cloud(LOOK)
-                stamp = self.scene.take_cloud(self.settings(), self.state_at)
-                if stamp is not None:
-                    at, points = float(self.driver.times_of(stamp)), self.scene.cloud
-                    loop.observe(at, clouds={CLOUD: points}, radius=self.scene.radius)
+                comes = scene.take_cloud(self.settings(), self.state_at)
         except ApexError as error:
             loop.abort(str(error))
 

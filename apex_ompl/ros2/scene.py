@@ -135,6 +135,7 @@ class Scene:
         observed: The observed obstacles by name, where they were seen last, with the time of the node's clock [ns].
         refused: Number of messages that were refused.
         cloud: The points of the last cloud, shape (N, 3) [m].
+        cloud_stamp: Time by the node's clock when they were there [ns].
         radius: Radius of the balls around them [m].
     """
 
@@ -152,7 +153,7 @@ class Scene:
             warn: Tells why a message is refused.
         """
         self.planner, self.observed, self.refused = planner, dict[str, tuple[int, Obstacle]](), 0
-        self.cloud, self.radius = np.zeros((0, 3)), 0.0
+        self.cloud, self.cloud_stamp, self.radius = np.zeros((0, 3)), 0, 0.0
         self._frames, self._inbox, self._tracked, self._warn = frames, inbox, dict(tracked), warn
         self._sources: dict[str, list[str]] = {}  # names of the obstacles that a marker made
         self._placed = set[str]()  # names of the observed obstacles that are in the world
@@ -168,21 +169,20 @@ class Scene:
         for message in world:
             for marker in message.markers:
                 self._try(self._edit, marker, state_at)
-        seen = self.take_cloud(settings, state_at) is not None
+        seen = self.take_cloud(settings, state_at)
         if seen:
             self.place_cloud()
         return bool(world) or seen
 
-    def take_cloud(self, settings: NodeSettings, state_at: Callable[[int], Array]) -> int | None:
-        """Take the cloud that waits as :attr:`cloud`; return its stamp by the node's clock [ns], None without one.
+    def take_cloud(self, settings: NodeSettings, state_at: Callable[[int], Array]) -> bool:
+        """Take the cloud that waits as :attr:`cloud`; return whether there was one that was not refused.
 
         Args:
             settings: Values of parameters.
             state_at: Returns the state at a time of the node's clock [ns], shape (dof,).
         """
         waiting = self._inbox.take_cloud()
-        found: int | None = None if waiting is None else self._try(self._read_cloud, *waiting, settings, state_at)
-        return found
+        return waiting is not None and bool(self._try(self._read_cloud, *waiting, settings, state_at))
 
     def place_cloud(self) -> None:
         """Put the last cloud into the world, in place of the one before."""
@@ -255,16 +255,16 @@ class Scene:
 
     def _read_cloud(
         self, received: int, cloud: Any, settings: NodeSettings, state_at: Callable[[int], Array]
-    ) -> int:  # fmt: skip
-        """Take the points of a cloud that are not on the robot, and return their stamp [ns]."""
+    ) -> bool:  # fmt: skip
+        """Take the points of a cloud that are not on the robot, and return True."""
         planner, radius = self.planner, HALF_DIAGONAL * settings.cell
         stamp = nanoseconds(cloud.header.stamp) or received
         q = state_at(stamp)
         points = thinned(moved(cloud_points(cloud), self._frames.pose(cloud.header.frame_id, q)), settings.cell)
         held = planner.world.held.values()
         self.cloud = filter_points(points, planner.robot, q, radius + settings.margin, held)
-        self.radius = radius
-        return stamp
+        self.cloud_stamp, self.radius = stamp, radius
+        return True
 
     def _seen(
         self, received: int, message: Any, name: str, state_at: Callable[[int], Array]
