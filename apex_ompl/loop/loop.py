@@ -221,7 +221,7 @@ class Loop:
         Raises:
             ParameterError: The stamp is no number, an object is no Obstacle, errors or clouds are not given by name, or
                 a cloud has another shape.
-            FileFormatError: The radius is not positive.
+            FileFormatError: The radius is not positive, or the name of a cloud is none for an obstacle.
         """
         for name, given in (("errors", errors), ("clouds", clouds)):
             if not isinstance(given, Mapping | None):

@@ -156,6 +156,42 @@ def test_observations_of_a_live_sensor_are_of_its_own_clock() -> None:
     assert (found.stamp, found.received) == (0.5, 0.5)
 
 
+def test_a_driver_that_stops_by_itself_ends_the_run_with_its_reason() -> None:
+    class Pushed(KinematicDriver):
+        def advance(self, until: float) -> None:
+            super().advance(until)
+            if until > 0.5 and not self.fault:
+                self.push(np.where(np.arange(len(self.names)) == 3, 0.1, 0.0))
+
+    driver = Pushed(robot(), exact().state().positions)
+    found = run(problems.load(PROBLEM), ByHand(line), speed=0.3, settings=SETTINGS, sensor=Camera(), driver=driver)
+    assert found.outcome is Outcome.ABORTED and found.reason.endswith(driver.fault)
+    assert "left_joint4 was 0.1 off its commanded position" in driver.fault
+    assert driver.end <= driver.time and not driver.state().velocities.any()
+
+
+def test_a_robot_at_rest_is_left_alone() -> None:
+    class Counted(KinematicDriver):
+        sent = 0
+
+        def send(self, motion: Trajectory, at: float) -> None:
+            self.sent += 1
+            super().send(motion, at)
+
+    near = BALL.model_copy(
+        update={"position": tuple(robot().link_pose(exact().state().positions, "left_hand_palm")[:3, 3] + 0.15)}
+    )
+
+    class Blocked(Camera):
+        def read(self, now: float) -> Observation | None:
+            return Observation(now, now, (near,))
+
+    driver = Counted(robot(), exact().state().positions)
+    settings = replace(SETTINGS, error=0.3, timeout=0.5)
+    found = run(problems.load(PROBLEM), ByHand(line), settings=settings, sensor=Blocked(), driver=driver)
+    assert found.outcome is Outcome.TIMEOUT and driver.sent == 0 and found.metrics["late_commands"] == 0.0
+
+
 @pytest.mark.parametrize(
     ("given", "words"),
     [({"driver": "mujco"}, "driver 'mujco', did you mean 'mujoco'"), ({"driver": 5}, "driver: expected a driver with"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -196,8 +198,57 @@ def test_a_cloud_replaces_the_last_one_of_its_camera_and_no_other() -> None:
         assert step(3, clouds={"right": np.full((2, 3), NAN)}) == {"right", "far"}
         refused = [event.data["why"] for event in loop.events if event.kind == "observation refused"]
         assert refused == ["the place of right is not finite"]
-        with pytest.raises(ParameterError, match=r"clouds: expected an array of shape \(N, 3\) for left"):
-            loop.observe(ZERO, clouds={"left": np.zeros((2, 2))})
+        assert step(4, clouds={"right": np.empty((0, 3))}, errors={"right": 0.01}) == {"far"}
+        for bad, why in (
+            ({"clouds": {"left": np.zeros((2, 2))}}, r"clouds: expected an array of shape \(N, 3\) for left"),
+            ({"clouds": far}, "clouds: expected a mapping by names"), ({"errors": 0.01}, "errors: expected a mapping"),
+        ):  # fmt: skip
+            with pytest.raises(ParameterError, match=why):
+                loop.observe(ZERO, **bad)
+
+
+def test_a_cloud_is_not_forgotten() -> None:
+    """An obstacle that is not seen any more is, while a camera that falls silent leaves what it saw."""
+    problem = problems.load(PROBLEM)
+    with Loop(problem, ByHand(line), settings=replace(SETTINGS, memory=0.5), process=False) as loop:
+        start, tracker = problem.start_state(loop.joint_names), loop._control.tracker
+        loop.observe(ZERO, [BALL], clouds={"camera": np.full((3, 3), 2.0)})
+        loop.step(ZERO, start)
+        assert set(tracker.tracks) == {"ball", "camera"}
+        for k in range(1, 10):
+            loop.observe(ZERO + 0.1 * k, [standing(FAR)])
+            loop.step(ZERO + 0.1 * k, start)
+        assert set(tracker.tracks) == {"far", "camera"}
+
+
+def test_observations_come_from_any_thread() -> None:
+    """Two cameras of their own threads lose no cloud, and no file of a cloud that is tracked."""
+    problem, count, started = problems.load(PROBLEM), 30, threading.Barrier(3)
+    with Loop(problem, ByHand(line), settings=SETTINGS, process=False) as loop:
+        start, rng = problem.start_state(loop.joint_names), np.random.default_rng(0)
+        clouds = rng.uniform(2.0, 2.2, (2, count, 5, 3))
+
+        def look(k: int) -> None:
+            started.wait()
+            for n, cloud in enumerate(clouds[k]):
+                loop.observe(ZERO + 1e-3 * n, clouds={f"camera{k}": cloud})
+
+        cameras = [threading.Thread(target=look, args=(k,)) for k in range(2)]
+        for camera in cameras:
+            camera.start()
+        started.wait()
+        for k in range(3, 20):
+            loop.step(ZERO + 0.01 * k, start)
+            time.sleep(0.002)
+        for camera in cameras:
+            camera.join()
+        loop.step(ZERO + 0.2, start)
+        tracks = loop._control.tracker.tracks
+        assert {name: len(track.looks) for name, track in tracks.items()} == {"camera0": 1, "camera1": 1}
+        for name, track in tracks.items():
+            assert track.shape.points is not None
+            assert np.allclose(np.load(track.shape.points.file), clouds[int(name[-1]), -1])
+        assert not [event for event in loop.events if event.kind == "observation refused"]
 
 
 @pytest.mark.parametrize("method", ["no-network", "rrtconnect"])
