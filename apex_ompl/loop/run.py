@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -72,12 +72,10 @@ def run_in(
         seed_ompl(seed)
         context = context_of(environment.problem, used, speed, seed)
         setup = context.setup
-        if isinstance(driver, str):
-            driver = named_driver(driver, environment.problem, setup.robot, clock)
-        elif driver is not None:
+        if driver is not None and not isinstance(driver, str):
             check_driver(driver, setup.robot, simulated=clock == SIMULATED)
         noted = {"loop": asdict(used), "sensor": _noted(sensor), "speed": speed, "costs": cost_table()["version"]}
-        noted |= {} if driver is None else {"driver": type(driver).__name__}
+        noted |= {} if driver is None else {"driver": driver if isinstance(driver, str) else type(driver).__name__}
         run = _Run(environment, context, replanning.name, clock, seed, noted)
         fault = setup.start_fault
         if fault or not len(context.goals):
@@ -93,6 +91,8 @@ def run_in(
             else:
                 process = stack.enter_context(PlannerProcess(work_of(context, method, seed), cores()[1]))
             if driver is not None:
+                if isinstance(driver, str):
+                    driver = stack.enter_context(closing(named_driver(driver, environment.problem, setup.robot, clock)))
                 answers = ImmediateReplanning(context, replanner) if clock == SIMULATED else process
                 return run.driven(driver, answers, sensor, tolerance)
             stream = stream_of(sensor, environment, used.watched)
