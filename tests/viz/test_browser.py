@@ -61,9 +61,7 @@ def with_a_cloud(problem: Problem, folder: Path) -> Problem:
 
 
 @pytest.mark.parametrize("name", ["ball_in_cup", "a cloud"])
-def test_pages_show_and_play_to_the_end(
-    driver: Any, name: str, request: pytest.FixtureRequest, tmp_path: Path
-) -> None:
+def test_pages_show_and_play_to_the_end(driver: Any, name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     if name == "a cloud":
         result = plan(with_a_cloud(arm_problem(tmp_path), tmp_path), timeout=20.0)
     else:

@@ -21,7 +21,6 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.problem import Problem
 from apex_ompl.viz.appearance import items_of
 from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
