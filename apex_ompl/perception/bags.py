@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,9 @@ from typing import Any
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.library import bag_reader
 from apex_ompl.perception.synchronizer import TOLERANCE, Synchronizer
 from apex_ompl.util.files import path_text
+from apex_ompl.util.forking import unforked
 
 ROLE = "bag of ROS 2"
 COLOR, ALIGNED = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
@@ -82,12 +83,27 @@ def bag_frames(
         raise FileFormatError(str(file), "", why, "expected a frame that is complete")
 
 
+def _reader() -> Callable[[Path], Any]:
+    """Return a function that opens the folder of a bag of ROS 2.
+
+    Raises:
+        MissingFileError: The extra ``bags`` is not installed.
+    """
+    try:
+        with unforked():
+            reading, types = import_module("rosbags.highlevel"), import_module("rosbags.typesys")
+    except ImportError as error:
+        raise MissingFileError("rosbags", "package for bags of ROS 2", "install the extra: apex-ompl[bags]") from error
+    store = types.get_typestore(types.Stores.ROS2_JAZZY)  # for bags without definitions
+    return lambda path: reading.AnyReader([path], default_typestore=store)
+
+
 def _messages(file: Path, types: Mapping[str, str]) -> Iterator[tuple[str, Any]]:
     """Yield topic and message of all messages of some topics, by topic and type, in the order in which they came."""
     if not file.is_dir():
         raise MissingFileError(str(file), ROLE, "expected a folder")
     try:
-        with bag_reader()(file) as bag:
+        with _reader()(file) as bag:
             there = {connection.topic: connection.msgtype for connection in bag.connections}
             for topic, kind in types.items():
                 if topic not in there:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.perception.camera import Camera, check_camera
-from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.frames import Frame, check_camera
 from apex_ompl.perception.messages import camera_of, color_image, depth_image
 from apex_ompl.timing.files import NANOSECONDS
 from apex_ompl.util.display import one_line
