@@ -85,6 +85,7 @@ class TwinCamera:
         """
         driver, state = self.driver, self.driver.state()
         twin = driver.twin
+        twin.move_obstacles(driver.data, state.stamp)
         mujoco().mj_kinematics(twin.model, driver.data)  # a step leaves the poses from before it
         pose = self.camera.pose if self.camera.link is None else driver.pose(self.camera.link) @ self.camera.pose
         drawing, measuring = self._opened()
