@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from apex_ompl.perception.camera import Camera as Camera
     from apex_ompl.perception.camera import DepthErrors as DepthErrors
     from apex_ompl.perception.camera import look_at as look_at
+    from apex_ompl.perception.depth_scale import measured_depths as measured_depths
     from apex_ompl.perception.frames import Frame as Frame
     from apex_ompl.perception.frames import load_frames as load_frames
     from apex_ompl.perception.frames import save_sequence as save_sequence
@@ -28,6 +29,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "bags": "bag_frames",
         "boards": "Board",
         "camera": "Camera DepthErrors look_at",
+        "depth_scale": "measured_depths",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
         "ros2_camera": "Ros2Camera",
