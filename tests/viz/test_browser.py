@@ -115,10 +115,10 @@ def projected(points: np.ndarray, camera: Any, size: tuple[int, int]) -> np.ndar
     ], axis=1)  # fmt: skip
 
 
-def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, tmp_path: Path) -> None:
+def test_a_link_is_seen_where_forward_kinematics_says(driver: Any, problem: Problem) -> None:
     driver.set_window_size(1200, 640)  # wide enough for the middle to be clear of the panel
-    shown = Shown.of(arm_problem(tmp_path).model_copy(update={"scene": ()}))
-    link, robot = "lower", shown.setup.robot
+    shown = Shown.of(problem.model_copy(update={"scene": ()}))
+    link, robot = "left_link6", shown.setup.robot
     with serving() as server:
         scenes = draw(server, [shown])
         for ghost in scenes[0]._ghosts.values():
