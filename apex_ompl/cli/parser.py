@@ -115,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_pictures(commands)
     _add_view(commands)
     _add_convert(commands)
+    _add_calibrate(commands)
     _add_benchmark(commands)
     _add_check(commands)
     for name, text in (
@@ -260,6 +261,22 @@ def _add_convert(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--joint", action="append", default=[], metavar="THEIRS=OURS", help="a joint by another name")
     parser.add_argument("--frame", action="append", default=[], metavar="THEIRS=OURS", help="a frame by another name")
     parser.set_defaults(run="commands:convert")
+
+
+def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("calibrate", help="find where a camera is, by frames of a board in many states")
+    parser.add_argument("frames", type=Path, help="folder of frames with color and joint positions")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="camera file to write (.yaml)")
+    parser.add_argument(
+        "--board", default="charuco:9x6:0.025", metavar="BOARD", help="KIND:COLUMNSxROWS:SQUARE by inner corners and "
+        "meters, KIND charuco or chessboard, or tag:SIDE (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--board-link", metavar="LINK", help="that carries the board (default: it stands still)")
+    parser.add_argument("--camera-link", metavar="LINK", help="that carries the camera (default: it stands still)")
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="camera file (default: the frames' own)")
+    parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints that may read a constant too much")
+    parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
+    parser.set_defaults(run="perception:calibrate")
 
 
 def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:
