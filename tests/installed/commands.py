@@ -53,13 +53,14 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         "plan ball_in_cup --timeout 20 --objective calm --calm-factor 1.3 --max-tool-speed 1.0 --payload left_hand=0.5 "
         "--torque-scale 0.9 --max-torque left_joint1=80",
     ),
-    ((0,), "plan ball_in_cup --timeout 20 --objective length --no-torque-limits"),
+    ((0,), "plan ball_in_cup --timeout 20 --objective length --no-torque-limits --to-goal"),
     (
         (0, 1),
         "run popup/vertical/large/12 --method no-network --clock sim --prediction cv --speed 0.9 --budget 0.05 "
         "--latency 0.05 --timeout 4 --evade risk --seed 1 --out run.npz --json",
     ),
     ((0, 1), "run own.yaml --clock real --timeout 3 --out real.json"),
+    ((2,), "ros2 own.yaml --ros-args -p speed:=7.0"),  # without ROS as well as with a faulty parameter
     ((0,), "render plan.npz --out plan.png --azimuth 10"),
     ((0,), "plot plan.npz --out plan.svg"),
     ((0,), "plot run.npz --out run.png"),
