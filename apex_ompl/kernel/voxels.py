@@ -59,7 +59,6 @@ class ImageBlocks(NamedTuple):
         singles = np.ascontiguousarray(flat[order], np.float32)
         return cls(order, singles, first, whole.astype(np.int8), np.stack([low, side]), (rows, columns))
 
-
     def depths(self, image: Array) -> Singles:
         """Return the depths of an image, shape (height, width), in the order of the pixels, shape (P,) [m]."""
         return image.ravel()[self.order].astype(np.float32)

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from apex_ompl.perception.hand_eye import Calibration as Calibration
     from apex_ompl.perception.hand_eye import View as View
     from apex_ompl.perception.hand_eye import calibrate as calibrate
+    from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
+    from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
@@ -25,5 +27,6 @@ __all__, __getattr__, __dir__ = lazy_names(
         "camera": "Camera DepthErrors look_at",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
+        "occupancy": "OccupancyMap OccupancySettings",
     },  # fmt: skip
 )
