@@ -152,7 +152,9 @@ def _load(name: str, shape: MeshFile | PointFile | GridFile) -> coal.CollisionGe
     """Return the geometry in a file; files of the same content, read alike, share it."""
     role = f"{'mesh' if isinstance(shape, MeshFile) else 'file'} of {name!r}"
     content = read_file(Path(shape.file), role) if shape.content is None else base64.b64decode(shape.content)
-    how = f"{type(shape).__name__} {shape.model_dump_json(exclude={'file', 'content'})} {Path(shape.file).suffix.lower()}"
+    how = (
+        f"{type(shape).__name__} {shape.model_dump_json(exclude={'file', 'content'})} {Path(shape.file).suffix.lower()}"
+    )
     key = hashlib.sha256(content + how.encode()).hexdigest()
     with _loading:
         geometry = _meshes.get(key)

@@ -11,6 +11,8 @@ from apex_ompl.kernel.compiled.perception import voxels
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import compact
 
+SPREAD = 2.507  # extent of a normal distribution whose density is that of its middle [standard deviations]
+LEAST_NOISE = 1e-9
 FREE, UNKNOWN = voxels.FREE, voxels.UNKNOWN  # evidence of voxels; larger numbers are those of occupied ones
 
 
@@ -24,6 +26,7 @@ class ImageBlocks(NamedTuple):
         whole: Whether the image holds the block as a whole, shape (rows columns,).
         plane: Corner of the first block, and sides of a block, shape (2, 2) [m].
         shape: Rows and columns of blocks.
+        density: Pixels of a unit of the plane [1/m^2].
     """
 
     order: Integers
@@ -32,6 +35,7 @@ class ImageBlocks(NamedTuple):
     whole: Bytes
     plane: Array
     shape: tuple[int, int]
+    density: float
 
     @classmethod
     def of(cls, rays: Array, focal: tuple[float, float], size: int) -> Self:
@@ -57,7 +61,8 @@ class ImageBlocks(NamedTuple):
         whole = (counts > 0) & (~cut | (counts == size * size))
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         singles = np.ascontiguousarray(flat[order], np.float32)
-        return cls(order, singles, first, whole.astype(np.int8), np.stack([low, side]), (rows, columns))
+        plane, density = np.stack([low, side]), float(focal[0] * focal[1])
+        return cls(order, singles, first, whole.astype(np.int8), plane, (rows, columns), density)
 
     def depths(self, image: Array) -> Singles:
         """Return the depths of an image, shape (height, width), in the order of the pixels, shape (P,) [m]."""
@@ -103,11 +108,13 @@ class SeenPoints(NamedTuple):
         rays: The points of the plane z = 1 m of the optical frame at which they are seen, shape (P, 2) [m].
         depths: Their depths, 0 where there is none, shape (P,) [m].
         left_out: 1 for points on the robot or on what it holds, shape (P,).
+        density: Points of a surface across the line of sight at a depth of 1 m [1/m^2].
     """
 
     rays: Singles
     depths: Singles
     left_out: Bytes
+    density: float
 
     @classmethod
     def of(cls, blocks: ImageBlocks, image: Array, spheres: Array) -> Self:
@@ -121,7 +128,7 @@ class SeenPoints(NamedTuple):
         depths = blocks.depths(image)
         inside = np.zeros(len(depths), np.int8)
         voxels.mark_inside(depths, blocks.rays, blocks.first, blocks.plane, blocks.shape[1], compact(spheres), inside)
-        return cls(blocks.rays, depths, inside)
+        return cls(blocks.rays, depths, inside, blocks.density)
 
 
 class VoxelUpdate(NamedTuple):
@@ -131,9 +138,11 @@ class VoxelUpdate(NamedTuple):
         origin: Outer corner of the first voxel, shape (3,) [m].
         side: Side of a voxel [m].
         pose: Pose of the optical frame, shape (4, 4) [m].
-        enough: How many points make a voxel occupied.
+        share: Share of the points that a surface leaves in a voxel which makes it occupied.
+        enough: How many points are always enough.
         gain: What they add to its evidence.
         most: Largest evidence.
+        noise: Standard deviation of a depth z is ``noise`` z^2 [1/m].
         scale: Relative error of depths.
         angle: Error of the orientation of the camera [rad].
         shift: Error of its position [m].
@@ -142,9 +151,11 @@ class VoxelUpdate(NamedTuple):
     origin: Array
     side: float
     pose: Array
+    share: float
     enough: int
     gain: int
     most: int
+    noise: float
     scale: float
     angle: float
     shift: float
@@ -152,9 +163,11 @@ class VoxelUpdate(NamedTuple):
     def apply(self, evidence: Bytes, windows: DepthWindows, points: SeenPoints) -> None:
         """Change the evidence of voxels, shape (nx, ny, nz)."""
         blocks, pose, hits = windows.blocks, compact(self.pose), np.zeros_like(evidence)
+        sharp = self.side / (SPREAD * max(self.noise, LEAST_NOISE))
         voxels.fill_voxels(
             evidence, hits, points.depths, points.rays, points.left_out, windows.nearest, windows.farthest, pose,
-            self.origin, self.side, self.enough, self.gain, self.most,
+            self.origin, self.side, self.share * points.density * self.side * self.side, sharp, self.enough, self.gain,
+            self.most,
         )  # fmt: skip
         halves = 0.5 * self.side * np.abs(pose[:3, :3]).sum(axis=0)  # along the axes of the camera
         corner, side = blocks.plane

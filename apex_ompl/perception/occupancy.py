@@ -9,7 +9,7 @@ pixels; no ray is followed.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -27,7 +27,8 @@ from apex_ompl.perception.frames import Frame
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.grids import voxels_of
-from apex_ompl.types import Array, Flags
+from apex_ompl.scene.points import points_of
+from apex_ompl.types import Array, Flags, Indices
 from apex_ompl.util.display import one_line
 from apex_ompl.util.files import pack_archive, path_text, read_archive, write_atomically
 from apex_ompl.util.schema import check_version
@@ -44,9 +45,10 @@ from apex_ompl.util.validation import (
 SCHEMA, ROLE, KEY = "apex-ompl/occupancy/1", "occupancy map", "map"
 MOST_VOXELS = 50_000_000
 LEVELS = 16  # sizes of windows of blocks; nearer voxels, whose images are larger, are not cleared
-POLICIES = ("free", "blocked")
+POLICIES, SHAPES = ("free", "blocked"), ("points", "voxels")
 
 Unknown = Literal["free", "blocked"]
+Shape = Literal["points", "voxels"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,9 @@ class OccupancySettings:
         missing: Largest share of pixels without a depth in a block of the image that counts as seen.
         block: Side of such a block [pixels].
         stride: Stride of rows and columns of the pixels whose points make voxels occupied.
-        enough: How many of these points in a voxel make it occupied.
+        share: Share of the points that a surface across the line of sight leaves in a voxel, at its depth and with the
+            noise of depths, which makes the voxel occupied.
+        enough: How many of these points are always enough.
         persistence: Frames that must see through an occupied voxel, after one that saw it occupied, to free it.
         longest: The largest number of such frames, after many that saw it occupied.
         padding: Margin around robot and held objects inside of which points belong to them [m]; the noise of depths is
@@ -69,6 +73,7 @@ class OccupancySettings:
     missing: float = 0.25
     block: int = 4
     stride: int = 2
+    share: float = 0.3
     enough: int = 2
     persistence: int = 3
     longest: int = 9
@@ -84,6 +89,7 @@ class OccupancySettings:
         check_number(self.missing, "missing", 0.0, 0.99)
         check_integer(self.block, "block", 1, 64)
         check_integer(self.stride, "stride", 1, 64)
+        check_number(self.share, "share", 0.0, 1.0)
         check_integer(self.enough, "enough", 1, 100)
         check_integer(self.persistence, "persistence", 1, 100)
         check_integer(self.longest, "longest", self.persistence, 100)
@@ -182,12 +188,13 @@ class OccupancyMap:
                 no state of the robot; the pose is not rigid.
             UnknownNameError: The robot has no link that carries the camera, or one that holds an object.
         """
-        if camera is None:
-            if not isinstance(seen, Frame):
-                raise ParameterError("camera", None, "the camera of the depth image")
-            camera = seen.camera
-        joints = seen.joints if isinstance(seen, Frame) else {}
-        frame = Frame(camera, seen.depth if isinstance(seen, Frame) else np.asarray(seen), joints=joints)
+        if isinstance(seen, Frame):
+            frame = seen if camera is None else replace(seen, camera=camera)
+        elif camera is None:
+            raise ParameterError("camera", None, "the camera of the depth image")
+        else:
+            frame = Frame(camera, np.asarray(seen))
+        camera = frame.camera
         q = self._state(frame, state)
         placed = self._pose(camera, q) if pose is None else rigid_pose(pose, "pose")
         spheres = self._own_spheres(q, held, placed, camera.depth.noise)
@@ -220,8 +227,9 @@ class OccupancyMap:
         windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing, LEVELS)
         points = SeenPoints.of(samples, image[::stride, ::stride], spheres)
         VoxelUpdate(
-            self.origin, self.resolution, pose, settings.enough, settings.persistence, settings.longest,
-            spreads * depth.scale_spread, spreads * camera.angle_spread, spreads * camera.position_spread,
+            self.origin, self.resolution, pose, settings.share, settings.enough, settings.persistence,
+            settings.longest, depth.noise, spreads * depth.scale_spread, spreads * camera.angle_spread,
+            spreads * camera.position_spread,
         ).apply(self.evidence, windows, points)  # fmt: skip
 
     @cached_property
@@ -291,7 +299,7 @@ class OccupancyMap:
             ParameterError: The points have another shape, or are not finite.
         """
         given = finite_array(points, "points")
-        check_array(given, (len(given), 3) if given.ndim else (0, 3), "points")
+        check_array(given, ("N", 3), "points")
         cells = np.floor((given - self.origin) / self.resolution)
         inside = ((cells >= 0) & (cells < self.evidence.shape)).all(axis=1)
         found = np.zeros(len(given), np.int8)
@@ -299,8 +307,8 @@ class OccupancyMap:
         return found
 
     def blocked(
-        self, unknown: Unknown = "free", start: ArrayLike | None = None, held: Iterable[AttachedObject] = (),
-        margin: float = 0.01,
+        self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
+        held: Iterable[AttachedObject] = (), margin: float = 0.01,
     ) -> Flags:  # fmt: skip
         """Return the voxels that count as obstacles, shape (nx, ny, nz).
 
@@ -319,7 +327,7 @@ class OccupancyMap:
             return self.occupied
         if start is None:
             raise ParameterError("start", None, "the start of the plan, whose unknown voxels do not count as obstacles")
-        return self.occupied | (self.unknown & ~self.touched(start, held, margin))
+        return np.asarray(self.occupied | (self.unknown & ~self.touched(start, held, margin)))
 
     def touched(self, state: ArrayLike, held: Iterable[AttachedObject] = (), margin: float = 0.01) -> Flags:
         """Return the voxels that are within a margin of the robot and its held objects, shape (nx, ny, nz).
@@ -345,14 +353,14 @@ class OccupancyMap:
         found = mark_near(self.evidence.shape, self.origin, self.resolution, spheres) != 0
         cells = np.argwhere(found)
         found[tuple(cells.T)] = on_robot(self._centers(cells), checker.robot, q, within, kept.values())
-        return found
+        return np.asarray(found)
 
-    def _centers(self, cells: NDArray[np.int64]) -> Array:
+    def _centers(self, cells: Indices) -> Array:
         return np.asarray(self.origin + (cells + 0.5) * self.resolution)
 
     def points(
-        self, unknown: Unknown = "free", start: ArrayLike | None = None, held: Iterable[AttachedObject] = (),
-        margin: float = 0.01,
+        self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
+        held: Iterable[AttachedObject] = (), margin: float = 0.01,
     ) -> Array:  # fmt: skip
         """Return the centers of the voxels of :meth:`blocked`, whose arguments it has, shape (N, 3) [m].
 
@@ -362,7 +370,7 @@ class OccupancyMap:
         Raises:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
-        return self._centers(np.argwhere(self.blocked(unknown, start, held, margin)))
+        return self._centers(np.argwhere(self.blocked(unknown, start, held=held, margin=margin)))
 
     @property
     def ball_radius(self) -> float:
@@ -370,13 +378,21 @@ class OccupancyMap:
         return 0.5 * float(np.sqrt(3.0)) * self.resolution
 
     def world(
-        self, unknown: Unknown = "free", start: ArrayLike | None = None, held: Iterable[AttachedObject] = (),
-        margin: float = 0.01, name: str = "map",
+        self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
+        held: Iterable[AttachedObject] = (), margin: float = 0.01, name: str = "map", shape: Shape = "points",
     ) -> tuple[Obstacle, ...]:  # fmt: skip
         """Return the voxels of :meth:`blocked`, whose other arguments it has, as an obstacle that needs no file.
 
+        Plans among the points take less time than among the voxels themselves.
+
         Args:
+            unknown: As there.
+            start: As there.
+            held: As there.
+            margin: As there.
             name: Name of the obstacle.
+            shape: ``points``: the balls of :meth:`points` and ``ball_radius``, which contain the voxels. ``voxels``:
+                the cubes themselves.
 
         Returns:
             One obstacle, or none where no voxel counts as one.
@@ -384,10 +400,13 @@ class OccupancyMap:
         Raises:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
-        flags = self.blocked(unknown, start, held, margin)
+        check_name(shape, "shape of a map", SHAPES)
+        flags = self.blocked(unknown, start, held=held, margin=margin)
         if not flags.any():
             return ()
-        return (Obstacle(name=name, voxels=voxels_of(flags, self.resolution, self.origin)),)
+        if shape == "voxels":
+            return (Obstacle(name=name, voxels=voxels_of(flags, self.resolution, self.origin)),)
+        return (Obstacle(name=name, points=points_of(self._centers(np.argwhere(flags)), self.ball_radius)),)
 
     def save(self, path: str | Path) -> None:
         """Write the map (``.npz``, ``schema: apex-ompl/occupancy/1``), without the robot.

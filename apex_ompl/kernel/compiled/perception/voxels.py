@@ -57,7 +57,7 @@ def block_depths(
 
 @inlined
 def _tangents(across: float, along: float, radius: float) -> tuple[float, float]:
-    """Return between which x / z all points of a circle in front of the origin are, at x = ``across``, z = ``along``."""
+    """Return the least and the largest x / z of a circle about x = ``across``, z = ``along``, more than its radius."""
     square = across * across + along * along - radius * radius
     turn, bottom = radius * math.sqrt(square), along * along - radius * radius
     return (across * along - turn) / bottom, (across * along + turn) / bottom
@@ -105,14 +105,18 @@ def mark_inside(
 
 @entry_point
 def fill_voxels(
-    evidence: Bytes, hits: Bytes, depths: Singles, rays: Singles, inside: Bytes, nearest: float, farthest: float, pose: Floats,
-    origin: Floats, side: float, enough: int, gain: int, most: int,
+    evidence: Bytes, hits: Bytes, depths: Singles, rays: Singles, inside: Bytes, nearest: float, farthest: float,
+    pose: Floats, origin: Floats, side: float, dense: float, sharp: float, enough: int, gain: int, most: int,
 ) -> None:  # fmt: skip
     """Raise the evidence of voxels that hold enough points of an image.
 
+    How many are enough is a share of those that a surface across the line of sight leaves in a voxel: at a depth z it
+    has ``dense`` / z^2 in the area of the voxel's side, of which ``sharp`` / z^2, where that is less than 1, are within
+    one voxel along the line of sight.
+
     Args:
         evidence: FREE, UNKNOWN or more for occupied voxels, shape (nx, ny, nz).
-        hits: Gets how many points each voxel holds, at most ``enough``; 0 at the start.
+        hits: Gets how many points each voxel holds, ``enough`` where they are enough; 0 at the start.
         depths: Depths of the pixels, shape (P,) [m]; UNSEEN or less where there is none.
         rays: Their points at depth 1, shape (P, 2).
         inside: Pixels that are left out, shape (P,).
@@ -121,8 +125,10 @@ def fill_voxels(
         pose: Pose of the optical frame, shape (4, 4) [m].
         origin: Outer corner of the first voxel, shape (3,) [m].
         side: Side of a voxel [m].
-        enough: How many points make a voxel occupied.
-        gain: What they add to its evidence, which is UNKNOWN at least before.
+        dense: The share, times points at a depth of 1 m [m^2].
+        sharp: Side of a voxel over the extent of the noise at 1 m [m^2].
+        enough: How many points are always enough; one is the least.
+        gain: What they add to a voxel's evidence, which is UNKNOWN at least before.
         most: Largest evidence.
     """
     nx, ny, nz = evidence.shape
@@ -139,10 +145,14 @@ def fill_voxels(
         if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz):
             continue
         i, j, k = int(x), int(y), int(z)
-        if hits[i, j, k] < enough:
-            hits[i, j, k] += 1
-            if hits[i, j, k] == enough:
-                evidence[i, j, k] = min(max(evidence[i, j, k], UNKNOWN) + gain, most)
+        found = hits[i, j, k] + 1
+        if found > enough:
+            continue
+        over = 1.0 / (depth * depth)
+        if found == enough or found >= dense * over * min(1.0, sharp * over):
+            evidence[i, j, k] = min(max(evidence[i, j, k], UNKNOWN) + gain, most)
+            found = enough
+        hits[i, j, k] = found
 
 
 @inlined
