@@ -139,7 +139,7 @@ class VoxelUpdate(NamedTuple):
         side: Side of a voxel [m].
         pose: Pose of the optical frame, shape (4, 4) [m].
         share: Share of the points that a surface leaves in a voxel which makes it occupied.
-        enough: How many points are always enough.
+        least: How many points are the least, where more are to be expected.
         gain: What they add to its evidence.
         most: Largest evidence.
         noise: Standard deviation of a depth z is ``noise`` z^2 [1/m].
@@ -152,7 +152,7 @@ class VoxelUpdate(NamedTuple):
     side: float
     pose: Array
     share: float
-    enough: int
+    least: int
     gain: int
     most: int
     noise: float
@@ -166,15 +166,15 @@ class VoxelUpdate(NamedTuple):
         sharp = self.side / (SPREAD * max(self.noise, LEAST_NOISE))
         voxels.fill_voxels(
             evidence, hits, points.depths, points.rays, points.left_out, windows.nearest, windows.farthest, pose,
-            self.origin, self.side, self.share * points.density * self.side * self.side, sharp, self.enough, self.gain,
-            self.most,
+            self.origin, self.side, points.density * self.side * self.side, sharp, self.share, float(self.least),
+            self.gain, self.most,
         )  # fmt: skip
         halves = 0.5 * self.side * np.abs(pose[:3, :3]).sum(axis=0)  # along the axes of the camera
         corner, side = blocks.plane
         widest = np.abs(np.stack([corner, corner + side * blocks.shape[::-1]])).max(axis=0)
         radius = ((halves[:2] + widest * halves[2] + self.shift) / side).max()
         voxels.clear_voxels(
-            evidence, hits, windows.near, blocks.plane, pose, self.origin, self.side, self.enough,
+            evidence, hits, windows.near, blocks.plane, pose, self.origin, self.side,
             windows.nearest + float(halves[2]), windows.farthest, 1.0 + self.scale + self.angle * float(widest.sum()),
             float(halves[2]) + self.shift, float(halves[2]), float(radius),
             float((self.angle * (1.0 + widest * widest) / side).max()),

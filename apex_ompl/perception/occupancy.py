@@ -62,7 +62,7 @@ class OccupancySettings:
         stride: Stride of rows and columns of the pixels whose points make voxels occupied.
         share: Share of the points that a surface across the line of sight leaves in a voxel, at its depth and with the
             noise of depths, which makes the voxel occupied.
-        enough: How many of these points are always enough.
+        least: How many of these points are the least; fewer are enough where hardly as many are to be expected.
         persistence: Frames that must see through an occupied voxel, after one that saw it occupied, to free it.
         longest: The largest number of such frames, after many that saw it occupied.
         padding: Margin around robot and held objects inside of which points belong to them [m]; the noise of depths is
@@ -73,8 +73,8 @@ class OccupancySettings:
     missing: float = 0.25
     block: int = 4
     stride: int = 2
-    share: float = 0.3
-    enough: int = 2
+    share: float = 0.15
+    least: int = 2
     persistence: int = 3
     longest: int = 9
     padding: float = 0.015
@@ -90,7 +90,7 @@ class OccupancySettings:
         check_integer(self.block, "block", 1, 64)
         check_integer(self.stride, "stride", 1, 64)
         check_number(self.share, "share", 0.0, 1.0)
-        check_integer(self.enough, "enough", 1, 100)
+        check_integer(self.least, "least", 1, 100)
         check_integer(self.persistence, "persistence", 1, 100)
         check_integer(self.longest, "longest", self.persistence, 100)
         check_number(self.padding, "padding", 0.0, 0.5)
@@ -227,7 +227,7 @@ class OccupancyMap:
         windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing, LEVELS)
         points = SeenPoints.of(samples, image[::stride, ::stride], spheres)
         VoxelUpdate(
-            self.origin, self.resolution, pose, settings.share, settings.enough, settings.persistence,
+            self.origin, self.resolution, pose, settings.share, settings.least, settings.persistence,
             settings.longest, depth.noise, spreads * depth.scale_spread, spreads * camera.angle_spread,
             spreads * camera.position_spread,
         ).apply(self.evidence, windows, points)  # fmt: skip

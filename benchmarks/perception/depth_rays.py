@@ -18,6 +18,7 @@ from apex_ompl.perception import Camera
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body
 
+AWAY = 1000.0  # [m]
 EDGE = 0.03  # difference of neighboring depths at an edge [m]
 MISSING, FLYING = 0.5, 0.2  # shares of the pixels at edges without a depth, and with one in between
 COMMON, OWN = 0.8, 0.6  # parts of the noise that pixels of a patch share, and that each has for itself
@@ -29,7 +30,7 @@ class RayScene:
     def __init__(self, robot: Robot, obstacles: Iterable[Body] = (), held: Sequence[AttachedObject] = ()) -> None:
         """Build the model; poses of the robot and its held objects are set by :meth:`depth`."""
         self.robot, self.held = robot, tuple(held)
-        spec, self._mobile = mujoco.MjSpec(), list[tuple[int, pin.SE3]]()
+        spec = mujoco.MjSpec()
         for item in robot.geometry.geometryObjects:
             body = spec.worldbody.add_body(name=f"robot {item.name}", mocap=True)
             _add(spec, body, item.geometry, np.eye(4))
@@ -41,16 +42,19 @@ class RayScene:
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
 
-    def depth(self, camera: Camera, pose: np.ndarray, state: np.ndarray) -> np.ndarray:
-        """Return the true depths that a camera at a pose sees, shape (height, width) [m]; 0 where there is nothing."""
-        robot, data = self.robot, self._data
-        placed = robot.model.createData()
-        pin.forwardKinematics(robot.model, placed, robot.to_pinocchio(state))
-        at = [placed.oMi[item.parentJoint] * item.placement for item in robot.geometry.geometryObjects]
-        at += [pin.SE3(robot.link_pose(state, one.link) @ one.pose) for one in self.held]
+    def depth(self, camera: Camera, pose: np.ndarray, state: np.ndarray, robot: bool = True) -> np.ndarray:
+        """Return the true depths that a camera at a pose sees, shape (height, width) [m]; 0 where there is nothing.
+
+        Without the robot, it and what it holds are not in sight.
+        """
+        made, data = self.robot, self._data
+        placed = made.model.createData()
+        pin.forwardKinematics(made.model, placed, made.to_pinocchio(state))
+        at = [placed.oMi[item.parentJoint] * item.placement for item in made.geometry.geometryObjects]
+        at += [pin.SE3(made.link_pose(state, one.link) @ one.pose) for one in self.held]
         for k, one in enumerate(at):
             turn = pin.Quaternion(one.rotation).coeffs()
-            data.mocap_pos[k], data.mocap_quat[k] = one.translation, turn[[3, 0, 1, 2]]
+            data.mocap_pos[k], data.mocap_quat[k] = one.translation + (0.0 if robot else AWAY), turn[[3, 0, 1, 2]]
         mujoco.mj_forward(self._model, data)
         rays = np.concatenate([camera.grid, np.ones((*camera.grid.shape[:2], 1))], axis=2).reshape(-1, 3)
         lengths = np.linalg.norm(rays, axis=1)

@@ -113,11 +113,11 @@ def inside(shape: Any, local: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(local, axis=-1) <= shape.radius)
 
 
-@pytest.mark.parametrize(("stride", "enough"), [(1, 1), (1, 3), (2, 1)])
-def test_voxels_with_enough_points_are_occupied(stride: int, enough: int) -> None:
+@pytest.mark.parametrize(("stride", "least"), [(1, 1), (1, 3), (2, 1)])
+def test_voxels_with_enough_points_are_occupied(stride: int, least: int) -> None:
     solids, pose = scene(5)
     image = true_depth(solids, CAMERA, pose)
-    made = map_of((image, pose), stride=stride, enough=enough, share=1.0)
+    made = map_of((image, pose), stride=stride, least=least, share=0.0)
     points = CAMERA.points(image)[::stride, ::stride].reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)] @ pose[:3, :3].T + pose[:3, 3]
     cells = np.floor((points - made.origin) / SIDE)
@@ -127,7 +127,7 @@ def test_voxels_with_enough_points_are_occupied(stride: int, enough: int) -> Non
     np.add.at(counts, tuple(cells[good].astype(int).T), 1)
     np.add.at(doubtful, tuple(cells[good & rim].astype(int).T), 1)  # single precision may put them next door
     sure = doubtful == 0
-    assert (made.occupied[sure] == (counts[sure] >= enough)).mean() > 0.999
+    assert (made.occupied[sure] == (counts[sure] >= least)).mean() > 0.999
     assert made.occupied.sum() > 100
 
 
@@ -301,7 +301,7 @@ def test_a_plan_among_what_was_seen_is_free_in_the_true_scene(tmp_path: Path, un
 
 def test_maps_are_saved_and_loaded(tmp_path: Path, arm: Robot) -> None:
     solids, pose = scene(7)
-    made = map_of((true_depth(solids, CAMERA, pose), pose), enough=1, persistence=4)
+    made = map_of((true_depth(solids, CAMERA, pose), pose), least=1, persistence=4)
     made.save(tmp_path / "map.npz")
     again = OccupancyMap.load(tmp_path / "map.npz", arm)
     assert (again.evidence == made.evidence).all() and again.settings == made.settings and again.robot is arm

@@ -12,6 +12,8 @@ from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Bytes, Floats, Integers, Singles
 
 FREE, UNKNOWN = -1, 0  # evidence of a voxel; above it the voxel is occupied
+ENOUGH = 127  # number of points of a voxel that an image shows to be occupied
+MOST_OF = 0.5  # share of the points to be expected that is enough where these are few
 UNSEEN = 0.0  # depth of a block that is not known
 
 
@@ -106,17 +108,18 @@ def mark_inside(
 @entry_point
 def fill_voxels(
     evidence: Bytes, hits: Bytes, depths: Singles, rays: Singles, inside: Bytes, nearest: float, farthest: float,
-    pose: Floats, origin: Floats, side: float, dense: float, sharp: float, enough: int, gain: int, most: int,
+    pose: Floats, origin: Floats, side: float, dense: float, sharp: float, share: float, least: float, gain: int,
+    most: int,
 ) -> None:  # fmt: skip
     """Raise the evidence of voxels that hold enough points of an image.
 
-    How many are enough is a share of those that a surface across the line of sight leaves in a voxel: at a depth z it
-    has ``dense`` / z^2 in the area of the voxel's side, of which ``sharp`` / z^2, where that is less than 1, are within
-    one voxel along the line of sight.
+    A surface across the line of sight at a depth z leaves ``dense`` / z^2 points in a voxel, or, where its noise is
+    larger than the voxel, ``sharp`` / z^2 of these. A share of that many is enough, and at least ``least``, or MOST_OF
+    those that are to be expected.
 
     Args:
         evidence: FREE, UNKNOWN or more for occupied voxels, shape (nx, ny, nz).
-        hits: Gets how many points each voxel holds, ``enough`` where they are enough; 0 at the start.
+        hits: Gets how many points each voxel holds, ENOUGH where they are enough; 0 at the start.
         depths: Depths of the pixels, shape (P,) [m]; UNSEEN or less where there is none.
         rays: Their points at depth 1, shape (P, 2).
         inside: Pixels that are left out, shape (P,).
@@ -125,9 +128,10 @@ def fill_voxels(
         pose: Pose of the optical frame, shape (4, 4) [m].
         origin: Outer corner of the first voxel, shape (3,) [m].
         side: Side of a voxel [m].
-        dense: The share, times points at a depth of 1 m [m^2].
+        dense: Points in the area of a voxel's side at 1 m [m^2].
         sharp: Side of a voxel over the extent of the noise at 1 m [m^2].
-        enough: How many points are always enough; one is the least.
+        share: The share.
+        least: How many points are the least, where more are to be expected.
         gain: What they add to a voxel's evidence, which is UNKNOWN at least before.
         most: Largest evidence.
     """
@@ -145,13 +149,15 @@ def fill_voxels(
         if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz):
             continue
         i, j, k = int(x), int(y), int(z)
-        found = hits[i, j, k] + 1
-        if found > enough:
+        found = hits[i, j, k]
+        if found == ENOUGH:
             continue
         over = 1.0 / (depth * depth)
-        if found == enough or found >= dense * over * min(1.0, sharp * over):
+        expected = dense * over * min(1.0, sharp * over)
+        found += 1
+        if found == ENOUGH or found >= max(share * expected, min(least, MOST_OF * expected)):
             evidence[i, j, k] = min(max(evidence[i, j, k], UNKNOWN) + gain, most)
-            found = enough
+            found = ENOUGH
         hits[i, j, k] = found
 
 
@@ -168,7 +174,7 @@ def _narrowed(low: float, high: float, start: float, step: float) -> tuple[float
 @entry_point
 def clear_voxels(
     evidence: Bytes, hits: Bytes, near: Singles, plane: Floats, pose: Floats, origin: Floats, side: float,
-    enough: int, nearest: float, farthest: float, stretch: float, reach: float, half: float, radius: float,
+    nearest: float, farthest: float, stretch: float, reach: float, half: float, radius: float,
     margin: float,
 ) -> None:  # fmt: skip
     """Lower the evidence of voxels that are in front of all surfaces which the image shows where they appear.
@@ -179,17 +185,16 @@ def clear_voxels(
 
     Args:
         evidence: FREE, UNKNOWN or more for occupied voxels, shape (nx, ny, nz).
-        hits: How many points each voxel holds.
+        hits: How many points each voxel holds, by :func:`fill_voxels`.
         near: Least depths by :func:`block_depths`, shape (levels, rows, columns) [m].
         plane: Corner of the first block and sides of a block at depth 1, shape (2, 2).
         pose: Pose of the optical frame, shape (4, 4) [m].
         origin: Outer corner of the first voxel, shape (3,) [m].
         side: Side of a voxel [m].
-        enough: How many points make a voxel occupied.
         nearest: Smallest depth of a center, more than ``half`` [m].
         farthest: Largest depth of a center [m].
         stretch: Factor of a center's depth by its largest relative error.
-        reach: Depth from there on that must be free, too [m].
+        reach: Depth beyond it that must be free, too [m].
         half: Half the extent of a voxel along the optical axis [m].
         radius: Half the extent of a voxel's image, times depth less ``half`` [blocks m].
         margin: What is added to that [blocks].
@@ -216,7 +221,7 @@ def clear_voxels(
                 continue
             for k in range(int(math.ceil(low)), int(math.floor(high)) + 1):
                 found = evidence[i, j, k]
-                if found <= FREE or hits[i, j, k] >= enough:
+                if found <= FREE or hits[i, j, k] == ENOUGH:
                     continue
                 depth = z + k * dz
                 inverse = 1.0 / depth
