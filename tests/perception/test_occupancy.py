@@ -142,7 +142,7 @@ def test_far_and_noisy_surfaces_need_fewer_points() -> None:
         made = OccupancyMap(((-0.2, -0.4, -0.4), (0.3, 0.4, 0.4)), 0.04, settings=OccupancySettings(share=share))
         made.integrate(image, noisy, pose)
         shares.append(made.occupied.any(axis=0).mean())
-    assert shares[0] < 0.8 and shares[1] > 0.95  # of the wall
+    assert shares[1] > 1.5 * shares[0]  # of the wall
 
 
 def test_an_error_of_the_camera_within_its_spread_frees_no_solid() -> None:
