@@ -289,7 +289,7 @@ def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--board-link", metavar="LINK", help="that carries the board (default: it stands still)")
     parser.add_argument("--camera-link", metavar="LINK", help="that carries the camera (default: it stands still)")
     parser.add_argument("--camera", type=Path, metavar="FILE", help="camera file (default: the frames' own)")
-    parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints that may read a constant too much")
+    parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints whose readings may be off")
     parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
     parser.set_defaults(run="perception:calibrate")
 

@@ -19,8 +19,8 @@ from apex_ompl.util.validation import check_array, check_integer, check_positive
 
 LARGEST = 1e4  # larger coordinates are errors [m]
 MILLIMETER = 1e-3  # unit of depth images of whole numbers [m]
-SOME = 4096  # depths whose median is taken
 FEW, MANY = 50, 50.0  # depths of whole numbers are larger [mm], medians of others are not [m]
+SAMPLED = 10_000  # pixels by which the unit of an image is checked
 PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -297,16 +297,24 @@ def depth_in_meters(depth: ArrayLike) -> Array:
     image = number_array(depth, "depth")
     if image.ndim != 2:
         raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
-    with np.errstate(invalid="ignore"):
-        seen = image[np.isfinite(image) & (image > 0.0)]
     if np.asarray(depth).dtype.kind in "iu":
-        if len(seen) and seen.max() <= FEW:
-            raise ParameterError("depth", f"whole numbers up to {seen.max():g}", "millimeters, or floats in meters")
+        largest = image.max(initial=0.0)
+        if 0.0 < largest <= FEW:
+            raise ParameterError("depth", f"whole numbers up to {largest:g}", "millimeters, or floats in meters")
         return image * MILLIMETER
-    middle = np.median(seen[:: len(seen) // SOME + 1]) if len(seen) else 0.0
-    if middle > MANY:
-        raise ParameterError("depth", f"floats around {middle:g}", "meters, or whole numbers in millimeters")
+    pixels = image.ravel()
+    seen = _depths(pixels[:: 1 + pixels.size // SAMPLED])
+    if not len(seen):
+        seen = _depths(pixels)
+    if len(seen) and np.median(seen) > MANY:
+        raise ParameterError("depth", f"floats around {np.median(seen):g}", "meters, or whole numbers in millimeters")
     return image
+
+
+def _depths(pixels: Array) -> Array:
+    """Return the numbers that are depths."""
+    with np.errstate(invalid="ignore"):
+        return pixels[np.isfinite(pixels) & (pixels > 0.0)]
 
 
 def points_of(points: ArrayLike, radius: float) -> PointFile:

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 import apex_ompl
@@ -151,6 +150,8 @@ def _write_frames(robot: apex_ompl.Robot) -> None:
 
 def _board_image(camera: Camera, pose: Any) -> Any:
     """Return the image of a board of 6 times 5 squares of 6 cm, or None where a part of it is outside."""
+    import cv2  # here, since the words of the calls are read without it
+
     markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
     board = cv2.aruco.CharucoBoard((6, 5), 0.06, 0.045, markers).generateImage((240, 200))
     ends = np.array([[0, 0], [240, 0], [240, 200], [0, 200]], np.float32)
