@@ -70,7 +70,7 @@ class OccupancySettings:
     """
 
     spreads: float = 2.0
-    missing: float = 0.25
+    missing: float = 0.5
     block: int = 4
     stride: int = 2
     share: float = 0.15

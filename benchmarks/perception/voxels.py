@@ -52,6 +52,7 @@ BOX = np.array([[-0.6, -1.2, -0.1], [1.8, 1.2, 1.5]])
 SIDES = (0.01, 0.02, 0.04)
 ROOM = (
     Obstacle(name="back_wall", box=(0.1, 6.0, 4.0), position=(-1.3, 0.0, 0.5)),
+    Obstacle(name="front_wall", box=(0.1, 6.0, 4.0), position=(2.5, 0.0, 0.5)),
     Obstacle(name="left_wall", box=(6.0, 0.1, 4.0), position=(0.0, 1.9, 0.5)),
     Obstacle(name="right_wall", box=(6.0, 0.1, 4.0), position=(0.0, -1.9, 0.5)),
     Obstacle(name="ground", box=(6.0, 6.0, 0.1), position=(0.0, 0.0, -0.8)),
