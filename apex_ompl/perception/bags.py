@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -10,15 +11,16 @@ from typing import Any
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.library import bag_reader
 from apex_ompl.perception.synchronizer import TOLERANCE, Synchronizer
 from apex_ompl.util.files import path_text
+from apex_ompl.util.forking import unforked
 
 ROLE = "bag of ROS 2"
 COLOR, ALIGNED = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
 INFO, STATES = "/camera/camera/color/camera_info", "/joint_states"
 """Topics of a RealSense camera with depths aligned to colors, and of joint states."""
-IMAGE_TYPE, INFO_TYPE, STATES_TYPE = (f"sensor_msgs/msg/{name}" for name in ("Image", "CameraInfo", "JointState"))
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO_TYPES, STATES_TYPES = ("sensor_msgs/msg/CameraInfo",), ("sensor_msgs/msg/JointState",)
 
 
 def bag_frames(
@@ -56,8 +58,8 @@ def bag_frames(
         tolerance=tolerance, rectified=rectified,
     )  # fmt: skip
     kinds = [
-        (color, IMAGE_TYPE, together.color), (depth, IMAGE_TYPE, together.depth),
-        (states, STATES_TYPE, together.states), (info if camera is None else None, INFO_TYPE, together.info),
+        (color, IMAGE_TYPES, together.color), (depth, IMAGE_TYPES, together.depth),
+        (states, STATES_TYPES, together.states), (info if camera is None else None, INFO_TYPES, together.info),
     ]  # fmt: skip
     takes = {topic: (kind, take) for topic, kind, take in kinds if topic is not None}
     if len(takes) < sum(topic is not None for topic, _, _ in kinds):
@@ -82,18 +84,33 @@ def bag_frames(
         raise FileFormatError(str(file), "", why, "expected a frame that is complete")
 
 
-def _messages(file: Path, types: Mapping[str, str]) -> Iterator[tuple[str, Any]]:
-    """Yield topic and message of all messages of some topics, by topic and type, in the order in which they came."""
+def _reader() -> Callable[[Path], Any]:
+    """Return a function that opens the folder of a bag of ROS 2.
+
+    Raises:
+        MissingFileError: The extra ``bags`` is not installed.
+    """
+    try:
+        with unforked():
+            reading, types = import_module("rosbags.highlevel"), import_module("rosbags.typesys")
+    except ImportError as error:
+        raise MissingFileError("rosbags", "package for bags of ROS 2", "install the extra: apex-ompl[bags]") from error
+    store = types.get_typestore(types.Stores.ROS2_JAZZY)  # for bags without definitions
+    return lambda path: reading.AnyReader([path], default_typestore=store)
+
+
+def _messages(file: Path, types: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[str, Any]]:
+    """Yield topic and message of all messages of some topics, by topic and types, in the order in which they came."""
     if not file.is_dir():
         raise MissingFileError(str(file), ROLE, "expected a folder")
     try:
-        with bag_reader()(file) as bag:
+        with _reader()(file) as bag:
             there = {connection.topic: connection.msgtype for connection in bag.connections}
-            for topic, kind in types.items():
+            for topic, known in types.items():
                 if topic not in there:
                     raise UnknownNameError("topic", topic, tuple(there))
-                if there[topic] != kind:
-                    raise FileFormatError(str(file), topic, there[topic], f"expected messages of {kind}")
+                if there[topic] not in known:
+                    raise FileFormatError(str(file), topic, there[topic], f"expected messages of {' or '.join(known)}")
             wanted = [connection for connection in bag.connections if connection.topic in types]
             for connection, _, data in bag.messages(connections=wanted):
                 yield connection.topic, bag.deserialize(data, connection.msgtype)

@@ -303,16 +303,6 @@ def _grid(
     return found
 
 
-def check_camera(given: object, name: str = "camera") -> None:
-    """Check that an object is a camera.
-
-    Raises:
-        ParameterError: It is none.
-    """
-    if not isinstance(given, Camera):
-        raise ParameterError(name, given, "a Camera")
-
-
 def placement(pose: Array) -> dict[str, tuple[float, ...]]:
     """Return position and orientation (xyzw) of a pose, shape (4, 4), as files have them."""
     quaternion = pin.Quaternion(pose[:3, :3]).normalized().coeffs()

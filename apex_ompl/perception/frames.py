@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, MissingFileError, ParameterError
-from apex_ompl.perception.camera import Camera, check_camera
+from apex_ompl.perception.camera import Camera
 from apex_ompl.scene.points import depth_in_meters
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
@@ -127,6 +127,16 @@ class Frame:
             return cls(camera, arrays["depth"], arrays.get("color"), stamp, about["joints"])
         except ParameterError as error:
             raise FileFormatError(str(file), error.name, error.value, f"expected {error.expected}") from error
+
+
+def check_camera(given: object, name: str = "camera") -> None:
+    """Check that an object is a camera.
+
+    Raises:
+        ParameterError: It is none.
+    """
+    if not isinstance(given, Camera):
+        raise ParameterError(name, given, "a Camera")
 
 
 def save_sequence(frames: Iterable[Frame], folder: str | Path) -> int:

@@ -1,10 +1,9 @@
-"""The optional libraries: OpenCV, SciPy and rosbags."""
+"""The optional libraries: OpenCV and SciPy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from apex_ompl.errors import MissingFileError
@@ -38,18 +37,3 @@ def least_squares() -> Callable[..., Any]:
             return found
     except ImportError as error:
         raise MissingFileError("scipy", "package for least squares", HINT) from error
-
-
-def bag_reader() -> Callable[[Path], Any]:
-    """Return a function that opens the folder of a bag of ROS 2.
-
-    Raises:
-        MissingFileError: The extra ``bags`` is not installed.
-    """
-    try:
-        with unforked():
-            reading, types = import_module("rosbags.highlevel"), import_module("rosbags.typesys")
-    except ImportError as error:
-        raise MissingFileError("rosbags", "package for bags of ROS 2", "install the extra: apex-ompl[bags]") from error
-    store = types.get_typestore(types.Stores.ROS2_JAZZY)  # for bags without definitions
-    return lambda path: reading.AnyReader([path], default_typestore=store)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.library import opencv
 from apex_ompl.util.schema import validate
 
 COLORS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0]),
@@ -16,17 +17,22 @@ COLORS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]
 """Encodings of colors: channels, and which of them are red, green and blue."""
 DEPTHS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encodings of depths: whole millimeters of 16 bits, or meters."""
+DEPTH_FORMATS = ("16UC1; compressedDepth", "16UC1; compressedDepth png")
+DEPTH_HEADER = 12  # bytes before the PNG of a compressed depth image
 PLUMB_BOB = 5  # coefficients
 LARGEST_SKEW = 1e-6  # of the axes of pixels, by the focal length
 
 
 def color_image(message: Any) -> NDArray[np.uint8]:
-    """Return a ``sensor_msgs/Image`` as red, green and blue, shape (height, width, 3).
+    """Return a ``sensor_msgs/Image`` or ``CompressedImage`` as red, green and blue, shape (height, width, 3).
 
     Raises:
-        ParameterError: It has another encoding than those of 8 bits with one, three or four channels, or fewer bytes
-            than it says.
+        ParameterError: It has another encoding than those of 8 bits with one, three or four channels, fewer bytes than
+            it says, or cannot be decoded.
+        MissingFileError: It is compressed, and the extra ``perception`` is not installed.
     """
+    if hasattr(message, "format"):
+        return np.ascontiguousarray(_decoded(message, message.data, "color image", "IMREAD_COLOR")[..., ::-1])
     if message.encoding not in COLORS:
         raise ParameterError("color image", f"encoding {message.encoding!r}", ", ".join(COLORS))
     channels, order = COLORS[message.encoding]
@@ -37,13 +43,34 @@ def color_image(message: Any) -> NDArray[np.uint8]:
 def depth_image(message: Any) -> NDArray[Any]:
     """Return a ``sensor_msgs/Image`` as depths, shape (height, width): uint16 [mm], or float32 [m] (REP 118).
 
+    A ``CompressedImage`` of the transport ``compressedDepth`` is a PNG of 16 bits after a header.
+
     Raises:
-        ParameterError: It has another encoding than 16UC1, mono16 or 32FC1, or fewer bytes than it says.
+        ParameterError: It has another encoding than 16UC1, mono16 or 32FC1, fewer bytes than it says, or is compressed
+            in another way.
+        MissingFileError: It is compressed, and the extra ``perception`` is not installed.
     """
+    if hasattr(message, "format"):
+        if message.format.strip() not in DEPTH_FORMATS:
+            raise ParameterError("depth image", f"format {message.format!r}", " or ".join(DEPTH_FORMATS))
+        found = _decoded(message, bytes(message.data)[DEPTH_HEADER:], "depth image", "IMREAD_UNCHANGED")
+        if found.dtype != np.uint16 or found.ndim != 2:
+            raise ParameterError("depth image", f"{found.dtype} of shape {found.shape}", "16 bits a pixel")
+        return found
     if message.encoding not in DEPTHS:
         raise ParameterError("depth image", f"encoding {message.encoding!r}", ", ".join(DEPTHS))
     kind = np.dtype((">" if message.is_bigendian else "<") + DEPTHS[message.encoding])
     return _rows(message, kind, 1, "depth image").astype(kind.newbyteorder("="))
+
+
+def _decoded(message: Any, data: Any, name: str, flag: str) -> NDArray[Any]:
+    """Return an image that is compressed, as OpenCV has it: blue, green and red."""
+    cv2 = opencv()
+    given = np.frombuffer(data, np.uint8)
+    found = cv2.imdecode(given, getattr(cv2, flag)) if len(given) else None
+    if found is None:
+        raise ParameterError(name, f"{len(given)} bytes of the format {message.format!r}", "a JPEG or PNG image")
+    return np.asarray(found)
 
 
 def _rows(message: Any, kind: np.dtype[Any], channels: int, name: str) -> NDArray[Any]:

@@ -17,7 +17,11 @@ from apex_ompl.perception.synchronizer import TOLERANCE, Synchronizer
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_integer, check_positive
 
-NEEDED = {"sensor_msgs.msg": ("CameraInfo", "Image", "JointState"), "rclpy.qos": ("qos_profile_sensor_data",)}
+NEEDED = {
+    "sensor_msgs.msg": ("CameraInfo", "CompressedImage", "Image", "JointState"),
+    "rclpy.qos": ("qos_profile_sensor_data",),
+}
+COMPRESSED = ("/compressed", "/compressedDepth")  # ends of topics of the transports of these names
 KEPT = 30  # frames that wait to be taken
 
 
@@ -34,6 +38,8 @@ class Ros2Camera:
         tolerance: float = TOLERANCE, rectified: bool = False, kept: int = KEPT,
     ) -> None:  # fmt: skip
         """Subscribe; the topics are by default those of a RealSense camera with depths aligned to colors.
+
+        Topics that end in ``/compressed`` or ``/compressedDepth`` have ``CompressedImage`` messages.
 
         Args:
             node: A node of the caller's (``rclpy.node.Node``), which the caller spins in another thread.
@@ -62,7 +68,8 @@ class Ros2Camera:
             tolerance=tolerance, rectified=rectified,
         )  # fmt: skip
         wanted = [
-            (color, ros.Image, together.color), (depth, ros.Image, together.depth),
+            (color, ros.CompressedImage if (color or "").endswith(COMPRESSED) else ros.Image, together.color),
+            (depth, ros.CompressedImage if (depth or "").endswith(COMPRESSED) else ros.Image, together.depth),
             (states, ros.JointState, together.states),
             (info if camera is None else None, ros.CameraInfo, together.info),
         ]  # fmt: skip

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.perception.camera import Camera, check_camera
-from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.frames import Frame, check_camera
 from apex_ompl.perception.messages import camera_of, color_image, depth_image
 from apex_ompl.timing.files import NANOSECONDS
 from apex_ompl.util.display import one_line
@@ -81,7 +81,7 @@ class Synchronizer:
             self.camera = camera_of(message, rectified=self._rectified)
 
     def color(self, message: Any) -> None:
-        """Take a color image, a ``sensor_msgs/Image``.
+        """Take a color image, a ``sensor_msgs/Image`` or ``CompressedImage``.
 
         Raises:
             ParameterError: As :func:`apex_ompl.perception.messages.color_image`.
@@ -89,7 +89,7 @@ class Synchronizer:
         (self._colors if self._paired else self._mains).append((_stamp(message), color_image(message)))
 
     def depth(self, message: Any) -> None:
-        """Take a depth image that is aligned to the color image, a ``sensor_msgs/Image``.
+        """Take a depth image that is aligned to the color image, a ``sensor_msgs/Image`` or ``CompressedImage``.
 
         Raises:
             ParameterError: As :func:`apex_ompl.perception.messages.depth_image`.

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import MissingFileError, ParameterError
-from apex_ompl.perception.camera import LARGEST_IMAGE, Camera, check_camera
-from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.camera import LARGEST_IMAGE, Camera
+from apex_ompl.perception.frames import Frame, check_camera
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_number, check_positive
@@ -85,6 +85,7 @@ class TwinCamera:
         """
         driver, state = self.driver, self.driver.state()
         twin = driver.twin
+        twin.move_obstacles(driver.data, state.stamp)
         mujoco().mj_kinematics(twin.model, driver.data)  # a step leaves the poses from before it
         pose = self.camera.pose if self.camera.link is None else driver.pose(self.camera.link) @ self.camera.pose
         drawing, measuring = self._opened()

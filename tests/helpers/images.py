@@ -66,6 +66,17 @@ def image(
     )  # fmt: skip
 
 
+def compressed(
+    source: Rosbags, pixels: np.ndarray, form: str, suffix: str, *, ns: int = START, head: bytes = b""
+) -> Any:
+    """Return a message of a compressed image: of colors red, green and blue, or of depths."""
+    import cv2
+
+    ordered = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    data = np.frombuffer(head + cv2.imencode(suffix, ordered)[1].tobytes(), np.uint8)
+    return source.stamped("sensor_msgs/CompressedImage", ns, format=form, data=data)
+
+
 def info(source: Rosbags, camera: Camera = CAMERA, **changes: Any) -> Any:
     fx, fy, cx, cy = *camera.focal, *camera.center
     fields = {

@@ -339,7 +339,17 @@ def _use_drivers() -> None:
 def _use_perception() -> None:
     """Calibration of a camera by corners as they would be found; docs/perception.md uses cameras and frames."""
     import apex_ompl
-    from apex_ompl.perception import Board, Camera, DepthErrors, Frame, View, calibrate, load_frames, look_at
+    from apex_ompl.perception import (
+        Board,
+        Camera,
+        DepthErrors,
+        Frame,
+        View,
+        calibrate,
+        load_frames,
+        look_at,
+        measured_depths,
+    )
 
     robot, board = apex_ompl.load_robot("panda"), Board(columns=5, rows=4, square=0.03)
     camera = Camera(width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5), depth=DepthErrors(noise=0.003))
@@ -356,6 +366,7 @@ def _use_perception() -> None:
     found = calibrate(robot, camera, board, views, board_link="panda_hand")
     assert np.abs(found.camera.pose_at(robot, robot.home) - eye).max() < 1e-3
     assert found.corrected({"a": 1.0}) == {"a": 1.0}
+    assert measured_depths(found, robot, board, [], board_link="panda_hand") is None
     assert board.find(np.full((480, 640, 3), 128, np.uint8)) is None
     found.camera.save("found.yaml")
     assert Camera.load("found.yaml") == found.camera and np.abs(camera.rays([319.5, 239.5])).max() < 1e-12

@@ -10,7 +10,17 @@ import pinocchio as pin
 import pytest
 
 from apex_ompl.errors import ApexError, ParameterError
-from apex_ompl.perception import Board, Calibration, Camera, Frame, View, calibrate, look_at, save_sequence
+from apex_ompl.perception import (
+    Board,
+    Calibration,
+    Camera,
+    Frame,
+    View,
+    calibrate,
+    look_at,
+    measured_depths,
+    save_sequence,
+)
 from apex_ompl.perception.hand_eye import _Fit
 from apex_ompl.robot import Robot
 
@@ -202,31 +212,46 @@ def test_unknown_links_and_joints_are_refused(robot: Robot, options: dict[str, A
         calibrate(robot, CAMERA, BOARD, views(robot, "board on the hand", count=4), **options)
 
 
-def frames(robot: Robot, count: int = 8) -> list[Frame]:
-    """Return frames of the board on the hand, of an arm without offsets."""
+def frames(robot: Robot, count: int = 8, scale: float = 1.0, noise: float = 0.0) -> list[Frame]:
+    """Return frames of the board on the hand, of an arm without offsets, with a wall 20 cm behind the board.
+
+    Args:
+        robot: The robot.
+        count: Number of frames.
+        scale: Factor by which measured depths become true ones; 0 without depths.
+        noise: Standard deviation of a depth z over z^2 [1/m].
+    """
     off = OFF.copy()
     OFF.clear()
     try:
         seen = views(robot, "board on the hand", LARGE, count=count)
     finally:
         OFF.update(off)
-    camera, board = truth(robot, "board on the hand")
-    depth, eye = np.zeros((480, 640)), np.linalg.inv(camera.pose)
-    return [
-        Frame(
-            CAMERA, depth, picture(LARGE, eye @ robot.link_pose(one.state, LINK) @ board), float(k),
-            dict(zip(robot.joint_names, one.state, strict=True)),
-        )
-        for k, one in enumerate(seen)
-    ]  # fmt: skip
+    (camera, board), rng, made = truth(robot, "board on the hand"), np.random.default_rng(0), []
+    for k, one in enumerate(seen):
+        pose = np.linalg.inv(camera.pose) @ robot.link_pose(one.state, LINK) @ board
+        depth = depths(pose, rng, noise) / scale if scale else np.zeros((480, 640))
+        joints = dict(zip(robot.joint_names, one.state, strict=True))
+        made.append(Frame(CAMERA, depth, picture(LARGE, pose), float(k), joints))
+    return made
+
+
+def depths(pose: np.ndarray, rng: np.random.Generator, noise: float) -> np.ndarray:
+    """Return depths of a board that is 5 cm larger than its corners, before a wall, shape (480, 640) [m]."""
+    corners = [[x, y, 0.0] for x, y in np.abs(LARGE.corners[:, :2]).max(axis=0) * [[-1, -1], [1, -1], [1, 1], [-1, 1]]]
+    outline = CAMERA.project(1.3 * np.array(corners) @ pose[:3, :3].T + pose[:3, 3])
+    inside = cv2.fillConvexPoly(np.zeros((480, 640), np.uint8), np.round(outline).astype(np.int32), 1).astype(bool)
+    plane = (pose[:3, 2] @ pose[:3, 3]) / (CAMERA.grid @ pose[:2, 2] + pose[2, 2])
+    true = np.where(inside, plane, plane.max() + 0.2)
+    return true + noise * true**2 * rng.normal(size=true.shape)
 
 
 def test_frames_are_calibrated_by_the_command_line(robot: Robot, tmp_path: Path, apex_cli: Any) -> None:
     blank = Frame(CAMERA, np.zeros((480, 640)), np.zeros((480, 640, 3), np.uint8), 100.0, frames(robot, 1)[0].joints)
-    save_sequence([*frames(robot), blank], tmp_path / "frames")
+    save_sequence([*frames(robot, scale=0.0), blank], tmp_path / "frames")
     board = ("--board", "charuco:5x4:0.06")
     done = apex_cli("calibrate", tmp_path / "frames", *board, "--board-link", LINK, "-o", tmp_path / "camera.yaml")
-    assert done.returncode == 0 and "8 of 9 frames" in done.stdout
+    assert done.returncode == 0 and "8 of 9 frames" in done.stdout and "depth       as before" in done.stdout
     found = Camera.load(tmp_path / "camera.yaml")
     true, _ = truth(robot, "board on the hand")
     assert np.linalg.norm(found.pose[:3, 3] - true.pose[:3, 3]) < 5e-3
@@ -239,6 +264,27 @@ def test_frames_of_two_cameras_are_refused(robot: Robot, tmp_path: Path, apex_cl
     options = ("--board", "charuco:5x4:0.06", "--board-link", LINK, "-o", tmp_path / "camera.yaml")
     done = apex_cli("calibrate", tmp_path / "frames", *options)
     assert done.returncode == 2 and "frame 4: expected frames of one camera" in done.stderr
+
+
+def test_scale_and_noise_of_depths_are_found(robot: Robot, tmp_path: Path, apex_cli: Any) -> None:
+    seen = frames(robot, 8, scale=1.02, noise=0.004)
+    found = calibrated(
+        robot, "board on the hand", [View(f.state(robot.joint_names), LARGE.find(f.color)) for f in seen], LARGE
+    )
+    depth = measured_depths(found, robot, LARGE, seen, board_link=LINK)
+    assert depth is not None and abs(depth.scale - 1.02) < 0.002 and 1e-4 <= depth.scale_spread < 0.002
+    assert depth.noise == pytest.approx(0.004, rel=0.1)
+    assert measured_depths(found, robot, LARGE, seen[:3], board_link=LINK) is None
+    with pytest.raises(ParameterError, match="images of shape"):
+        small = Camera(width=64, height=48, focal=(46.5, 46.5), center=(32.0, 24.0))
+        measured_depths(
+            found, robot, LARGE, [Frame(small, np.ones((48, 64)), None, 0.0, seen[0].joints)], board_link=LINK
+        )
+    save_sequence(seen, tmp_path / "frames")
+    options = ("--board", "charuco:5x4:0.06", "--board-link", LINK, "-o", tmp_path / "camera.yaml")
+    done = apex_cli("calibrate", tmp_path / "frames", *options)
+    assert done.returncode == 0 and "depth       scale 1.0" in done.stdout
+    assert abs(Camera.load(tmp_path / "camera.yaml").depth.scale - 1.02) < 0.002
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from images import CAMERA, START, Ros, Rosbags, image, info, states, store
+from images import CAMERA, START, Ros, Rosbags, compressed, image, info, states, store
 
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.perception import Camera, Frame, Synchronizer, bag_frames, load_frames, look_at, save_sequence
@@ -60,6 +60,31 @@ def test_depths_keep_their_unit(source: Rosbags, big: bool) -> None:
     frames = [Frame(CAMERA, depth) for depth in (floats, whole)]
     np.testing.assert_allclose(frames[0].depth, frames[1].depth, atol=0.51e-3)
     assert not frames[0].depth[0, :3].any()
+
+
+@pytest.mark.parametrize("source", sources())
+def test_compressed_images_are_decoded(source: Rosbags) -> None:
+    pytest.importorskip("cv2")
+    rows, columns = np.mgrid[0:48, 0:64]
+    color = np.stack([4 * columns, 5 * rows, 2 * (rows + columns)], axis=-1).astype(np.uint8)
+    exact = color_image(compressed(source, color, "rgb8; png compressed bgr8", ".png"))
+    np.testing.assert_array_equal(exact, color)
+    lossy = color_image(compressed(source, color, "rgb8; jpeg compressed bgr8", ".jpg")).astype(int)
+    assert lossy.shape == color.shape and np.abs(lossy - color).mean() < 4.0
+    depth = (1000 + rows * columns).astype(np.uint16)
+    for form in ("16UC1; compressedDepth png", "16UC1; compressedDepth"):
+        found = depth_image(compressed(source, depth, form, ".png", head=bytes(12)))
+        np.testing.assert_array_equal(found, depth)
+    for message, named in (
+        (compressed(source, depth, "32FC1; compressedDepth png", ".png", head=bytes(12)), "32FC1"),
+        (compressed(source, depth, "16UC1; compressedDepth rvl", ".png", head=bytes(12)), "rvl"),
+        (compressed(source, depth, "16UC1; compressedDepth", ".png"), "JPEG or PNG"),
+        (compressed(source, color, "16UC1; compressedDepth", ".png", head=bytes(12)), "16 bits a pixel"),
+    ):
+        with pytest.raises(ParameterError, match=named):
+            depth_image(message)
+    with pytest.raises(ParameterError, match="JPEG or PNG"):
+        color_image(source.stamped("sensor_msgs/CompressedImage", START, format="jpeg", data=np.zeros(9, np.uint8)))
 
 
 @pytest.mark.parametrize("source", sources())
@@ -149,9 +174,10 @@ def test_images_without_states_or_depths(tmp_path: Path) -> None:
         wrong.ready()
 
 
-def write_bag(folder: Path, *, plugin: StoragePlugin, count: int = 5, **parts: bool) -> None:
-    """Write a bag of a camera at 10 Hz and joint states at 50 Hz."""
-    source, kinds = Rosbags(), {COLOR: "Image", ALIGNED: "Image", INFO: "CameraInfo", STATES: "JointState"}
+def write_bag(folder: Path, *, plugin: StoragePlugin, count: int = 5, packed: bool = False, **parts: bool) -> None:
+    """Write a bag of a camera at 10 Hz, whose images may be compressed, and joint states at 50 Hz."""
+    of_images = "CompressedImage" if packed else "Image"
+    source, kinds = Rosbags(), {COLOR: of_images, ALIGNED: of_images, INFO: "CameraInfo", STATES: "JointState"}
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
         links = {
             topic: writer.add_connection(topic, f"sensor_msgs/msg/{kind}", typestore=store())
@@ -170,13 +196,21 @@ def write_bag(folder: Path, *, plugin: StoragePlugin, count: int = 5, **parts: b
                 at = ns + 5_000_000
                 if parts.get("info", True):
                     write(INFO, info(source), at)
-                write(ALIGNED, image(source, depth, "16UC1", at), at)
-                write(COLOR, image(source, color, "rgb8", at), at)
+                if packed:
+                    depths = compressed(source, depth, "16UC1; compressedDepth png", ".png", ns=at, head=bytes(12))
+                    colors = compressed(source, color, "rgb8; png compressed bgr8", ".png", ns=at)
+                else:
+                    depths, colors = image(source, depth, "16UC1", at), image(source, color, "rgb8", at)
+                write(ALIGNED, depths, at)
+                write(COLOR, colors, at)
 
 
+@pytest.mark.parametrize("packed", [False, True])
 @pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3], ids=["mcap", "sqlite"])
-def test_a_bag_is_read_without_ros(tmp_path: Path, plugin: StoragePlugin) -> None:
-    write_bag(tmp_path / "bag", plugin=plugin)
+def test_a_bag_is_read_without_ros(tmp_path: Path, plugin: StoragePlugin, packed: bool) -> None:
+    if packed:
+        pytest.importorskip("cv2")
+    write_bag(tmp_path / "bag", plugin=plugin, packed=packed)
     assert save_sequence(bag_frames(tmp_path / "bag"), tmp_path / "frames") == 5
     found = load_frames(tmp_path / "frames")
     for k, one in enumerate(found):
