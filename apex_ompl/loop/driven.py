@@ -18,6 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from apex_ompl.drivers.driver import Driver
 from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.timing import motion_extremes
 from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.cycle import Cycle
 from apex_ompl.loop.environment import LiveSensor, Observation
@@ -29,9 +30,10 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.process import running
 
-SAMPLE = 1e-3  # between two measured states of a driver on a simulated clock [s]
+SAMPLE, POLL = 1e-3, 2e-3  # between two measured states of a driver on a simulated clock, and on the wall clock [s]
+TINY = 1e-12  # range of a joint that stays where it is [rad; synergies 0..1]
 STANDING = 1000  # periods after which a run ends in which the driver's clock stood still
-LATE = "no command reached the driver in time for {:g} s"
+LATE = "the last {} commands did not reach the driver in time"
 
 
 def check_driver(driver: Any, robot: Robot, *, simulated: bool) -> None:
@@ -92,7 +94,7 @@ class DrivenRun:
     times: list[float] = field(default_factory=list)
     positions: list[Array] = field(default_factory=list)
     _late: int = 0
-    _unheard: float | None = None  # since when commands do not reach the driver [s]
+    _unheard: int = 0  # commands in a row that did not reach the driver
     _silent: bool = False
 
     def __post_init__(self) -> None:
@@ -125,13 +127,22 @@ class DrivenRun:
         return replace(record, measured={**record.measured, **self._figures(record.trajectory)})
 
     def executed(self) -> Trajectory | None:
-        """Return the measured motion, a cubic spline through its states, or None where there are less than two."""
+        """Return the measured motion, a cubic spline through its states, or None where there are less than two.
+
+        Joints that leave their range by rounding or between states, such as an open hand, are scaled into it.
+        """
         times = np.array(self.times)
         rows = np.flatnonzero(times >= 0.0)
         if len(rows) < 2:
             return None
         spline = CubicSpline(times[rows] - times[rows[0]], np.stack(self.positions)[rows])
-        states = np.stack([spline(spline.x, order) for order in range(3)])
+        states, limits = np.stack([spline(spline.x, order) for order in range(3)]), self.driver.limits
+        low, high = motion_extremes((spline.x, *states))[:2]
+        least, most = np.clip(low, limits.lower, limits.upper), np.clip(high, limits.lower, limits.upper)
+        share = (most - least) / np.maximum(high - low, TINY)
+        off = np.flatnonzero((least != low) | (most != high))
+        states[:, :, off] *= share[off]
+        states[0][:, off] += (least - low * share)[off]
         return Trajectory.unchecked(spline.x, states, self.driver.names)
 
     def _figures(self, commanded: Trajectory) -> dict[str, float]:
@@ -168,9 +179,9 @@ class DrivenRun:
             if not sent:
                 self.loop.missed()
         self.cycle.announce_start(command.at - self.zero)
-        silence = self.cycle.context.settings.silence
-        if self._unheard is not None and elapsed - self._unheard > silence:
-            self.cycle.abort(LATE.format(silence))
+        settings = self.cycle.context.settings
+        if self._unheard * settings.period > settings.silence:
+            self.cycle.abort(LATE.format(self._unheard))
 
     def _measured(self, elapsed: float) -> tuple[Array | None, float]:
         """Return the measured positions, None where the driver has none, and their stamp."""
@@ -199,22 +210,23 @@ class DrivenRun:
         try:
             self.driver.send(command.motion, command.at)
         except Exception as error:  # whatever a driver raises, the robot follows the stop that it was sent before
-            if self.driver.time <= command.at:
+            late = self.driver.time > command.at or (isinstance(error, ParameterError) and error.name == "at")
+            if not late:
                 self.cycle.abort(f"the driver refused a motion, {type(error).__name__}: {error}")
             self._late += 1
-            self._unheard = command.at - self.zero if self._unheard is None else self._unheard
+            self._unheard += 1
             return False
-        self._unheard = None
+        self._unheard = 0
         return True
 
     def _wait(self, until: float) -> None:
-        """Wait until a time since the start [s]."""
+        """Wait until a time since the start [s], and take the states that are measured until then."""
         driver: Any = self.driver
-        if not self.simulated:
-            time.sleep(max(until - (driver.time - self.zero), 0.0))
-            return
-        before = -math.inf
-        while before < driver.time < self.zero + until - SAME_TIME:
+        end, before = self.zero + until, -math.inf
+        while before < driver.time < end - SAME_TIME:
             before = driver.time
-            driver.advance(min(before + SAMPLE, self.zero + until))
+            if self.simulated:
+                driver.advance(min(before + SAMPLE, end))
+            else:
+                time.sleep(max(min(POLL, end - before), 0.0))
             self._measured(driver.time - self.zero)
