@@ -38,7 +38,7 @@ with Loop(problem, settings=LoopSettings(error=0.01, fastest=0.3, period=0.025))
             loop.abort(driver.fault)
         if (seen := camera.look(now)) is not None:
             loop.observe(now, seen)
-        command = loop.step(now, state.positions + (now - state.stamp) * state.velocities)
+        command = loop.step(now, state.positions, state.stamp)
         if command is not None and not (command.rests and driver.end <= command.at):
             try:
                 driver.send(command.motion, command.at)

@@ -213,6 +213,7 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
         "--clock", default="sim", help="sim (simulated, repeatable) or real, with the planner in its own process "
         "(default: %(default)s)",
     )  # fmt: skip
+    parser.add_argument("--driver", metavar="NAME", help="mujoco (in physics) or kinematic: the robot that is driven")
     parser.add_argument(
         "--prediction", default="cv", help="of obstacles: still, cv (constant velocity) or truth (default: %(default)s)"
     )

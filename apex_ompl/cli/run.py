@@ -20,7 +20,7 @@ def run(parsed: argparse.Namespace) -> int:
     settings = LoopSettings(budget=parsed.budget, latency=latency, timeout=parsed.timeout, evade=parsed.evade)
     result = api.run(
         parsed.world, parsed.method, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed,
-        speed=parsed.speed, settings=settings,
+        speed=parsed.speed, settings=settings, driver=parsed.driver,
     )  # fmt: skip
     if parsed.out is not None:
         result.save(parsed.out)

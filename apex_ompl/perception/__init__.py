@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from apex_ompl.perception.hand_eye import Calibration as Calibration
     from apex_ompl.perception.hand_eye import View as View
     from apex_ompl.perception.hand_eye import calibrate as calibrate
+    from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
+    from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
     from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
     from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
     from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
@@ -32,6 +34,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "depth_scale": "measured_depths",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
+        "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",
         "synchronizer": "Synchronizer",
         "twin_camera": "TwinCamera",

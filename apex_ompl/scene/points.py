@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.scene.bodies import PointFile
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN
-from apex_ompl.util.validation import check_array, check_integer, finite_array, number_array, rigid_pose
+from apex_ompl.util.validation import check_array, check_integer, check_positive, finite_array, number_array, rigid_pose
 
 LARGEST = 1e4  # larger coordinates are errors [m]
 MILLIMETER = 1e-3  # unit of depth images of whole numbers [m]
@@ -313,6 +315,24 @@ def _depths(pixels: Array) -> Array:
     """Return the numbers that are depths."""
     with np.errstate(invalid="ignore"):
         return pixels[np.isfinite(pixels) & (pixels > 0.0)]
+
+
+def points_of(points: ArrayLike, radius: float) -> PointFile:
+    """Return balls in memory as the ``points`` of an obstacle, which no file is needed for.
+
+    Args:
+        points: Their centers, shape (N, 3) [m].
+        radius: Their radius [m].
+
+    Raises:
+        ParameterError: The points have another shape or are not finite, there are none, or the radius is not positive.
+    """
+    cloud = finite_array(points, "points")
+    check_array(cloud, ("N", 3), "points", least=1)
+    check_positive(radius, "radius", "a positive number of meters")
+    content = io.BytesIO()
+    np.save(content, cloud.astype(np.float32))
+    return PointFile(file="memory.npy", radius=radius, content=base64.b64encode(content.getvalue()).decode())
 
 
 def points_from_depth(

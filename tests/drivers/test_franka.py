@@ -90,7 +90,7 @@ def arms_of(package: str, robot: Robot, tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def off(rows: Array, wanted: Callable[[float], Array], half: float) -> Array:
-    """How far references are from what is commanded in the middle of their cycle [rad], to a motion of 50 us, shape (N,).
+    """How far references are off what is commanded in the middle of their cycle, to 50 us of motion, shape (N,) [rad].
 
     The time of a reference is read a little after that of its cycle, on a busy machine longer after it.
     """

@@ -277,8 +277,10 @@ def _use_steps() -> None:
 
 
 def _use_run() -> None:
-    """The closed loop."""
+    """The closed loop, on its own clock and a driver's."""
     import apex_ompl
+    from apex_ompl.drivers import KinematicDriver
+    from apex_ompl.loop import Observation
 
     result = apex_ompl.run("popup/vertical/large/12", method="no-network")
     for name in ("run.npz", "run.json"):
@@ -286,14 +288,24 @@ def _use_run() -> None:
         assert apex_ompl.RunResult.load(name).as_dict() == result.as_dict()
     problem = apex_ompl.load_problem("vertical/free/1")
     settings = apex_ompl.LoopSettings(error=0.01, fastest=0.3)
+    ball = apex_ompl.Obstacle(name="ball", sphere={"radius": 0.05}, position=(1.5, 1.5, 1.0))
     with apex_ompl.Loop(problem, settings=settings) as loop:
-        loop.observe(0.0, [])
+        loop.observe(0.0, [ball], errors={"ball": 1e-4 * np.eye(3)}, clouds={"camera": np.full((5, 3), 2.0)})
         command = loop.step(0.0, problem.start_state(loop.joint_names))
         assert command is not None and command.rests and loop.outcome is None and loop.record is None
         assert loop.missed() is not None
         loop.abort("enough")
         assert loop.step(0.01) is not None and loop.outcome is not None and loop.reason == "enough"
         assert loop.events[-1].time <= 0.03
+
+    class Camera:
+        def read(self, now: float) -> Observation:
+            return Observation(now, now, (ball,))
+
+    robot = apex_ompl.load_robot(problem.robot)
+    driver = KinematicDriver(robot, problem.start_state(robot.joint_names))
+    result = apex_ompl.run(problem, "no-network", settings=settings, sensor=Camera(), driver=driver)
+    assert result.settings["driver"] == "KinematicDriver" and result.metrics["tracking_error"] < 1e-9
 
 
 def _use_drivers() -> None:
