@@ -49,7 +49,7 @@ HELD, TURNED = 0.005, 0.1  # most distance and angle of an object that is held [
 OFF = 0.005  # of an object at first [m]
 GAP = 0.0005  # between palm and object [m]
 SHARE = 0.5  # of candidates that are around the best ones
-SQUEEZES = 0.2, 1.0  # of synergies beyond first contact
+SQUEEZE = 0.8  # of synergies beyond first contact
 ROBUST = [(0.8, 1.2), (0.8, 0.8), (1.2, 1.2)]  # factors of friction and mass
 
 
@@ -61,7 +61,6 @@ class Candidate:
         position: Position [m].
         orientation: Quaternion xyzw.
         synergy: Just before first contact.
-        squeeze: Added to the synergy.
         moved: Largest distance from the pose [m]; that of the worst case where it held.
         turned: Largest angle from it [rad].
         robust: Number of cases held.
@@ -70,7 +69,6 @@ class Candidate:
     position: tuple[float, ...]
     orientation: tuple[float, ...]
     synergy: float
-    squeeze: float
     moved: float
     turned: float
     robust: int
@@ -134,19 +132,19 @@ class Search:
         self.mass, self.friction = float(model.body_mass[self.body]), model.geom_friction.copy()
         self.inertia = model.body_inertia[self.body].copy()
 
-    def draw(self, rng: np.random.Generator, best: list[Candidate]) -> tuple[Array, float]:
-        """Return a random pose and squeeze: around one of the best candidates, or around the problem's pose."""
+    def draw(self, rng: np.random.Generator, best: list[Candidate]) -> Array:
+        """Return a random pose: around one of the best candidates, or around the problem's pose."""
         if best and rng.random() < SHARE:
             one = best[int(rng.integers(len(best)))]
             pose = pose_matrix(one.position, one.orientation)
             pose[:3, 3] += rng.normal(0.0, 0.004, 3)
             pose[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, 0.08, 3)).as_matrix() @ pose[:3, :3]
-            return pose, float(np.clip(one.squeeze + rng.normal(0.0, 0.1), *SQUEEZES))
+            return pose
         pose = self.held.pose.copy()
         pose[:3, 3] += rng.uniform((-0.05, -0.09, -0.03), (0.05, 0.05, 0.02))
         tilt = rng.normal(0.0, 0.3, 3)
         pose[:3, :3] = Rotation.from_rotvec(tilt).as_matrix() @ pose[:3, :3]
-        return pose, float(rng.uniform(*SQUEEZES))
+        return pose
 
     def off_palm(self, pose: Array) -> Array | None:
         """Return a pose without contact with the open hand, along the normal of the palm; None if there is none."""
@@ -173,7 +171,7 @@ class Search:
         return found.synergy if found.touched else None
 
     def held_by(
-        self, pose: Array, synergy: float, squeeze: float, gravity: Array, factors: tuple[float, float] = (1.0, 1.0),
+        self, pose: Array, synergy: float, gravity: Array, factors: tuple[float, float] = (1.0, 1.0),
         at: Array | None = None,
     ) -> tuple[float, float, Array]:  # fmt: skip
         """Close the hand on the object, let go, and follow a motion.
@@ -192,7 +190,7 @@ class Search:
         model.eq_solref[self.weld], model.eq_solimp[self.weld, :2] = GUIDE, (0.9, 0.95)
         model.opt.gravity[:] = 0.0
         dt = twin.settings.step
-        target = min(1.0, synergy + squeeze)
+        target = min(1.0, synergy + SQUEEZE)
         begin = float(data.qpos[twin.q[0]])
         steps = round(CLOSING / dt)
         for k in range(steps):
@@ -222,19 +220,18 @@ class Search:
 
     def judged(self, rng: np.random.Generator, best: list[Candidate]) -> Candidate | None:
         """Return a random candidate with how it holds, or None where it does not."""
-        pose, squeeze = self.draw(rng, best)
-        clear = self.off_palm(pose)
+        clear = self.off_palm(self.draw(rng, best))
         synergy = None if clear is None else self.first_contact(clear)
         if clear is None or synergy is None:
             return None
         pose = clear
-        moved, turned, settled = self.held_by(pose, synergy, squeeze, self.gravities[0])
+        moved, turned, settled = self.held_by(pose, synergy, self.gravities[0])
         if not np.isfinite(moved):
             return None
         better = self.off_palm(settled)
         again = None if better is None else self.first_contact(better)
         if better is not None and again is not None and moved > 0.001:
-            other = self.held_by(better, again, squeeze, self.gravities[0])
+            other = self.held_by(better, again, self.gravities[0])
             if other[0] < moved:
                 pose, synergy, (moved, turned, _) = better, again, other
         held = 0
@@ -247,12 +244,12 @@ class Search:
                     shifted = self.off_palm(offset)
                     if shifted is None:
                         continue
-                    other = self.held_by(pose, synergy, squeeze, gravity, factors, shifted)
+                    other = self.held_by(pose, synergy, gravity, factors, shifted)
                     held += other[0] <= HELD and other[1] <= TURNED
         fields = pose_fields(pose)
         return Candidate(
             tuple(np.round(fields["position"], 5).tolist()), tuple(np.round(fields["orientation"], 6).tolist()),
-            round(synergy, 4), round(squeeze, 3), round(moved, 5), round(turned, 4), held,
+            round(synergy, 4), round(moved, 5), round(turned, 4), held,
         )  # fmt: skip
 
 

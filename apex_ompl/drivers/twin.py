@@ -186,6 +186,16 @@ class Twin:
         """Whether fingers yield, and held objects collide with the hands that hold them."""
         return self.settings.finger_stiffness is not None
 
+    def welded_to(self, held: AttachedObject) -> tuple[str, ...]:
+        """Return the links that an object can be welded to: its holder, and where fingers yield any palm.
+
+        An object that no link may touch stands on another one there, and is not welded.
+        """
+        if not self.yields:
+            return (held.link,)
+        palms = [hand.palm for hand in self.robot.hands.values()]
+        return () if held.touch_links == () else tuple(dict.fromkeys((held.link, *palms)))
+
     def weld(self, data: Any, name: str, link: str, active: bool = True) -> None:
         """Weld a held object to a link where it is now, or cut that weld.
 
@@ -423,8 +433,7 @@ class Twin:
         added.mass, added.ipos, added.explicitinertial = load.mass, load.center, True
         added.fullinertia = load.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         self._add_geoms(spec, added, coal_geometry(held), np.eye(4), "held")
-        palms = [hand.palm for hand in self.robot.hands.values()] if self.yields else []
-        for link in dict.fromkeys((held.link, *palms)):
+        for link in self.welded_to(held):
             weld = spec.add_equality(
                 name=f"{held.name} {link}", type=mj.mjtEq.mjEQ_WELD, objtype=mj.mjtObj.mjOBJ_BODY
             )
