@@ -39,10 +39,11 @@ FIRST = INSIDE + "first"
 
 
 class PlanStatus(StrEnum):
-    """OMPL's planner status names, and three more.
+    """OMPL's planner status names, and four more.
 
     TIMING_FAILED is for a proven path that could not be timed, START_OFF_CONSTRAINT and GOAL_OFF_CONSTRAINT for a start
-    or goals that violate a constraint along the path.
+    or goals that violate a constraint along the path, STEP_FAILED for a task whose steps after the goal cannot be done
+    from any goal that was found.
     """
 
     UNKNOWN = "UNKNOWN"
@@ -58,6 +59,7 @@ class PlanStatus(StrEnum):
     TIMING_FAILED = "TIMING_FAILED"
     START_OFF_CONSTRAINT = "START_OFF_CONSTRAINT"
     GOAL_OFF_CONSTRAINT = "GOAL_OFF_CONSTRAINT"
+    STEP_FAILED = "STEP_FAILED"
 
     @classmethod
     def of(cls, status: ob.PlannerStatus) -> PlanStatus:
@@ -241,6 +243,7 @@ class PlanResult:
             "constraint_violation": {},
             "constraint_bound": {},
             "nearest_state": None,
+            "goal_time": None,
         }
         data = dict.fromkeys(PROOF) | older | data  # older files lack some
         try:
@@ -264,9 +267,12 @@ class PlanResult:
                 constraint_bound=finite_numbers(data["constraint_bound"], "constraint_bound"),
                 nearest_state=None if nearest is None else finite_array(nearest, "nearest_state"), **number,
             )  # fmt: skip
+            motion = found.trajectory  # that of a task goes on after the goal
+            if motion is not None and data["goal_time"] is not None:
+                motion = motion.before(float(finite_array(data["goal_time"], "goal_time")))
             check_plan(
                 found.problem, robot=found.robot, joint_names=names, status=str(found.status), path=states,
-                motion=found.trajectory,
+                motion=motion,
             )  # fmt: skip
         except ParameterError as error:
             raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error

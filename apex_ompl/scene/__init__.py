@@ -23,6 +23,12 @@ if TYPE_CHECKING:
     from apex_ompl.scene.problem import PoseTarget as PoseTarget
     from apex_ompl.scene.problem import Problem as Problem
     from apex_ompl.scene.problem import Tolerance as Tolerance
+    from apex_ompl.scene.steps import GraspStep as GraspStep
+    from apex_ompl.scene.steps import HandStep as HandStep
+    from apex_ompl.scene.steps import LineStep as LineStep
+    from apex_ompl.scene.steps import ReleaseStep as ReleaseStep
+    from apex_ompl.scene.steps import RetreatStep as RetreatStep
+    from apex_ompl.scene.steps import WaitStep as WaitStep
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
@@ -31,5 +37,6 @@ __all__, __getattr__, __dir__ = lazy_names(
         "constraints": "FixedOrientation OnLine OnPlane Pose PoseTolerance RelativePose ToolRegion Upright",
         "points": "points_from_depth",
         "problem": "Alignment Goal PoseTarget Problem Tolerance",
+        "steps": "GraspStep HandStep LineStep ReleaseStep RetreatStep WaitStep",
     },
 )
