@@ -7,7 +7,7 @@ that two links of a hand press on may then be welded to its palm.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,19 +78,27 @@ class Grasps:
         for one, hand in held:
             self._hold(one.name, hand, first=True)
 
-    def grasp(self, name: str, hand: str) -> None:
-        """Close a hand on an object that another one holds, or that stands somewhere, and hold it."""
+    def grasp(self, name: str, hand: str, advance: Callable[[float], None] | None = None) -> None:
+        """Close a hand on an object that another one holds, or that stands somewhere, and hold it.
+
+        Args:
+            name: The object.
+            hand: The hand.
+            advance: Simulates up to a time [s], by default ``driver.advance``.
+        """
         self._press({hand})
-        self.driver.advance(self.driver.time + CLOSING)
+        (advance or self.driver.advance)(self.driver.time + CLOSING)
         self._hold(name, hand)
 
     def open(self, hand: str) -> None:
         """Take the pressure from a hand that is about to open."""
         self.driver.press(self._synergy(hand), 0.0)
 
-    def release(self, names: Collection[str], hand: str) -> None:
-        """Let objects go from a hand that has opened."""
-        self.driver.advance(self.driver.time + OPENING)
+    def release(
+        self, names: Collection[str], hand: str, advance: Callable[[float], None] | None = None
+    ) -> None:  # fmt: skip
+        """Let objects go from a hand that has opened; ``advance`` is as of :meth:`grasp`."""
+        (advance or self.driver.advance)(self.driver.time + OPENING)
         for name in names:
             self.driver.twin.weld(self.driver.data, name, self._palm(hand), active=False)
 

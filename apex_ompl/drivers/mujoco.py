@@ -126,6 +126,10 @@ class MujocoDriver:
         data, twin = self.data, self.twin
         return DriverState(self.time, data.qpos[twin.q].copy(), data.qvel[twin.v].copy())
 
+    def commanded(self) -> Array:
+        """Return the commanded positions, without what hands press beyond them, shape (dof,) [rad]."""
+        return np.asarray(self._commands.states(np.array([self.time]))[0, 0])
+
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         self._check_open()
