@@ -270,8 +270,9 @@ class MotionPlanner:
                 self.world.load(problem)
             given = PlanOptions(**options)
 
-            def plan_to(goals: Problem, timeout: float) -> PlanResult:
-                return self._plan(goals, planner, time.perf_counter(), replace(given, timeout=timeout))
+            def plan_to(goals: Problem, timeout: float, first: bool) -> PlanResult:
+                now = given if first else _from_rest(given)
+                return self._plan(goals, planner, time.perf_counter(), replace(now, timeout=timeout))
 
             return plan_task(self._checker, problem, given, plan_to)
 
@@ -528,6 +529,14 @@ class MotionPlanner:
         made = CollisionChecker(self.robot, scene.values(), held.values(), pairs)
         self._left = made if kept else self._left
         return made
+
+
+def _from_rest(options: PlanOptions) -> PlanOptions:
+    """Return the options of a later motion of a task: from rest, without contact to leave, and unconstrained."""
+    timing = options.timing
+    if not isinstance(timing, bool):
+        timing = replace(timing, start_velocity=(), start_acceleration=(), minimum_duration=0.0)
+    return replace(options, timing=timing, leave_contact=0.0, constraints=())
 
 
 def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from math import nan
 
 import coal
@@ -13,6 +14,7 @@ import pinocchio as pin
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.constraints.frames import frame_of
+from apex_ompl.constraints.line import SAME_POINT
 from apex_ompl.errors import SceneError, TimingError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.ompl.validity import full_check
@@ -21,8 +23,8 @@ from apex_ompl.planning.line_query import line_query
 from apex_ompl.planning.lines import plan_along
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
-from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import AnyStep, GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, WaitStep
+from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
+from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep, WaitStep
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
@@ -31,12 +33,24 @@ from apex_ompl.util.clocks import Deadline
 
 NEAR = 1e-5  # of a share of a line at which the search for its end stops [m]
 MOST_ADVANCES = 500
+ARC = np.radians(5.0)  # of a turn that a straight line replaces [rad]
+LATE = "the time is over"
+BLEND = 0.4  # of the way between two poses of a turn
 DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
-FINE = 1e-3  # spacing of the states at which that is examined [m]
+EXAMINED = 50  # states at which that is examined
 
 
 class StepFailed(Exception):  # noqa: N818 - an outcome, not an error
-    """A step that cannot be done from a state; the message is the reason."""
+    """A step that cannot be done from a state.
+
+    Attributes:
+        cause: The reason without the numbers of this state, by which failures are counted.
+    """
+
+    def __init__(self, reason: str, cause: str = "") -> None:
+        """Give the reason, and the cause if it is another text."""
+        super().__init__(reason)
+        self.cause = cause or reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,35 +95,40 @@ class StepPlanner:
         problem: The problem.
     """
 
-    def __init__(
-        self, checker: CollisionChecker, problem: Problem, deadline: Deadline, ends: Callable[[], bool]
-    ) -> None:  # fmt: skip
-        """Plan by ``checker`` until a deadline, or until ``ends`` holds."""
+    def __init__(self, checker: CollisionChecker, problem: Problem, deadline: Deadline, pressed: Callable[[], bool]) -> None:
+        """Plan by ``checker`` until a deadline, or until ``pressed`` holds."""
         self.checker, self.problem = checker, problem
-        self._deadline, self._ends = deadline, ends
+        self._deadline, self._pressed = deadline, pressed
+
+    def _ends(self) -> bool:
+        return self._pressed() or self._deadline.expired
 
     @property
     def robot(self) -> Robot:
         """The robot."""
         return self.checker.robot
 
-    def follow(self, world: TaskWorld, q: Array, timing: Timing | None) -> list[StepPlan]:
-        """Return all steps after the goal from a state, shape (dof,).
+    def follow(
+        self, steps: Sequence[AnyStep], world: TaskWorld, q: Array, timing: Timing | None, deadline: Deadline
+    ) -> list[StepPlan]:
+        """Return the plans of steps, which are no motions to further goals, one after the other.
 
         Args:
-            world: The world on the way to the goal.
-            q: The goal that is reached.
-            timing: How the steps are timed, or None for paths alone.
+            steps: The steps.
+            world: The world before them.
+            q: The state before them, shape (dof,).
+            timing: How they are timed, or None for paths alone.
+            deadline: When they are to be ready.
 
         Raises:
             StepFailed: One cannot be done; the message names it.
         """
-        found = list[StepPlan]()
-        for step in self.problem.after:
+        self._deadline, found = deadline, list[StepPlan]()
+        for step in steps:
             try:
                 found.append(self.plan(world, step, q, timing))
             except StepFailed as failure:
-                raise StepFailed(f"{step.title}: {failure}") from None
+                raise StepFailed(f"{step.title}: {failure}", f"{step.title}: {failure.cause}") from None
             world, q = found[-1].after, found[-1].end
         return found
 
@@ -122,9 +141,12 @@ class StepPlanner:
         if isinstance(step, WaitStep):
             return self._wait(world, step, q, timing)
         if isinstance(step, LineStep):
-            return self._line(world, step, q, self._poses(world, step, q), timing)
+            return self._line(world, step, q, [self._poses(world, step, q)], timing)
+        if isinstance(step, TurnStep):
+            return self._line(world, step, q, self._turned(world, step, q), timing)
         if isinstance(step, RetreatStep):
             return self._retreat(world, step, q, timing)
+        assert not isinstance(step, MoveStep)
         return self._hand(world, step, q, timing)
 
     def _become(self, world: TaskWorld, pairs: frozenset[tuple[str, str]] | None = None) -> None:
@@ -157,6 +179,24 @@ class StepPlanner:
         made[:3, :3] = turn @ pose[:3, :3]
         made[:3, 3] = turn @ (pose[:3, 3] - moved[0]) + fixed[0] + step.distance * fixed[1]
         return made
+
+    def _turned(self, world: TaskWorld, step: TurnStep, q: Array) -> list[dict[str, Array]]:
+        """Return the poses of frames along a turn about the origin of the first, a few degrees apart."""
+        poses = {}
+        for name in step.frame:
+            frame = frame_of(self.robot, name, world.held)
+            poses[name] = self.robot.link_pose(q, frame.link) @ frame.pose
+        first = poses[step.frame[0]]
+        to = np.asarray(step.to, float) / length(step.to)
+        turn = pin.AngleAxis(pin.Quaternion.FromTwoVectors(first[:3, 2], to))
+        count = max(1, int(np.ceil(turn.angle / ARC))) if len(poses) > 1 else 1  # its own origin needs no arc
+        found = []
+        for k in range(1, count + 1):
+            part = np.eye(4)
+            part[:3, :3] = pin.AngleAxis(turn.angle * k / count, turn.axis).toRotationMatrix()
+            part[:3, 3] = first[:3, 3] - part[:3, :3] @ first[:3, 3]
+            found.append({name: part @ pose for name, pose in poses.items()})
+        return found
 
     def _share(self, world: TaskWorld, moves: Mapping[str, Array], gap: float, q: Array) -> float:
         """Return the share of displacements after which a moved object is at a gap from another body, 1 at most.
@@ -191,22 +231,24 @@ class StepPlanner:
         return self.robot.link_pose(q, one.link) @ one.pose
 
     def _line(
-        self, world: TaskWorld, step: LineStep | RetreatStep, q: Array, poses: Mapping[str, Array],
+        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, poses: Sequence[Mapping[str, Array]],
         timing: Timing | None,
     ) -> StepPlan:  # fmt: skip
-        """Return a straight line to poses of frames."""
+        """Return straight lines from poses of frames to poses, with blends between them."""
         self._become(world)
         query = line_query(
-            self.checker, q, poses, frame=None, blend=0.0, speed=step.speed,
+            self.checker, q, list(poses), frame=None, blend=_blend(poses), speed=step.speed,
             timing=False if timing is None else _timing_in(world, timing), problem=lambda goals: self.problem,
         )  # fmt: skip
         found = plan_along(self.checker, query, self._deadline, self._ends)
         if not found or found.path is None:
-            raise StepFailed(found.reason)
+            raise StepFailed(found.reason, " ".join((f"{found.end}", *found.blocked_by)))
         path = found.path
         if not np.array_equal(path.states[0], q):
             raise StepFailed("the line does not start in the state before it")
         clearance = found.clearance if found.trajectory is None else found.motion_clearance
+        if np.isnan(clearance):  # the frames are there already
+            clearance = self.checker.clearance(q)
         return StepPlan(
             step, world, world.after(step, path.states[-1]), path, found.trajectory, clearance, use=found.limit_use,
             deviation=0.0 if found.trajectory is None else found.deviation,
@@ -229,7 +271,7 @@ class StepPlanner:
         self._become(during)
         check = full_check(self.checker, states, q, [end], deadline=self._deadline.at)
         if not check or check.proof is None:
-            raise StepFailed("out of time" if check.timed_out else check.reason)
+            raise StepFailed(LATE if check.timed_out else check.reason)
         found = StepPlan(step, during, world.after(step, end), Path(states), None, check.proof.clearance)
         return found if timing is None else self._timed(found, timing)
 
@@ -286,7 +328,7 @@ class StepPlanner:
         states, motion = q[None], None
         check = full_check(self.checker, states, q, deadline=self._deadline.at)
         if not check or check.proof is None:
-            raise StepFailed("out of time" if check.timed_out else check.reason)
+            raise StepFailed(LATE if check.timed_out else check.reason)
         if timing is not None:
             still = np.zeros((2, len(q)))
             motion = Trajectory(
@@ -301,13 +343,13 @@ class StepPlanner:
         pose = self.robot.link_pose(q, frame.link) @ frame.pose
         direction = -np.asarray(hand.axis, float) if step.direction is None else np.asarray(step.direction, float)
         pose[:3, 3] += step.distance / length(direction) * (pose[:3, :3] @ direction)
-        found = self._line(world, step, q, {step.hand: pose}, timing)
+        found = self._line(world, step, q, [{step.hand: pose}], timing)
         pairs = world.leaving_pairs(step.hand)
         if not pairs:
             return replace(found, left=0.0)
         self._become(world, world.pairs - pairs)
-        self._check_depths(found.path, pairs, step)
         left, clearance = self._left(found, step, world)
+        self._check_depths(found, left, pairs)
         return replace(found, left=left, clearance=min(clearance, found.clearance))
 
     def _left(self, found: StepPlan, step: RetreatStep, world: TaskWorld) -> tuple[float, float]:
@@ -322,6 +364,8 @@ class StepPlanner:
         def clearance_from(k: int) -> float | None:
             rest = states[k:] if motion is None else motion.after(places[k]) if places[k] > 0.0 else motion
             check = full_check(self.checker, rest, deadline=self._deadline.at)
+            if check.timed_out:
+                raise StepFailed(LATE)
             return None if not check or check.proof is None else check.proof.clearance
 
         low, high = -1, len(places) - 2 if len(places) > 1 else 0  # from ``high`` on it is proved
@@ -338,26 +382,40 @@ class StepPlanner:
                 high, clearance = middle, better
         return float(places[high]), clearance
 
-    def _check_depths(self, path: Path, pairs: frozenset[tuple[str, str]], step: RetreatStep) -> None:
-        """Check that contact with what a hand leaves does not become deeper along a path.
+    def _check_depths(self, plan: StepPlan, left: float, pairs: frozenset[tuple[str, str]]) -> None:
+        """Check that contact with what a hand leaves does not become deeper until it has left it.
+
+        Args:
+            plan: The retreat.
+            left: Where it has left it, a time or a number of states.
+            pairs: What may touch until then.
 
         Raises:
             StepFailed: It does.
         """
-        known = {frozenset(pair) for pair in pairs}
-        count = max(2, int(np.ceil(step.distance / FINE)) + 1)
-        places = np.linspace(0.0, len(path.states) - 1.0, count)
-        first = None
-        for place in places.tolist():
-            k = min(int(place), len(path.states) - 2) if len(path.states) > 1 else 0
-            after = path.states[min(k + 1, len(path.states) - 1)]
-            q = path.states[k] + (place - k) * (after - path.states[k])
-            found = [c for c in self.checker.contacts(q) if frozenset((c.first, c.second)) in known]
+        known, first, states = {frozenset(pair) for pair in pairs}, 0.0, plan.path.states
+        for k, place in enumerate(np.linspace(0.0, left, EXAMINED if left > 0.0 else 1).tolist()):
+            i = min(int(place), len(states) - 1)
+            q = states[i] + (place - i) * (states[min(i + 1, len(states) - 1)] - states[i])
+            q = q if plan.motion is None else plan.motion(place)
+            found = [] if self.checker.is_free(q) else self.checker.contacts(q)
+            found = [c for c in found if frozenset((c.first, c.second)) in known]
             depth = max((c.depth for c in found), default=0.0)
-            first = depth if first is None else first
+            first = depth if k == 0 else first
             if depth > first + DEEPER:
                 worst = max(found, key=lambda c: c.depth)
-                raise StepFailed(f"{worst.first} would go {1e3 * depth:.1f} mm deep into {worst.second}")
+                bodies = f"{worst.first} and {worst.second}"
+                raise StepFailed(f"{bodies} would overlap by {1e3 * depth:.1f} mm on the way", f"overlap {bodies}")
+
+
+def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
+    """Return the radius of blends between poses: a share of the shortest way of a frame from one to the next [m]."""
+    ways = [
+        length(following[name][:3, 3] - pose[:3, 3])
+        for one, following in pairwise(poses)
+        for name, pose in one.items()
+    ]
+    return BLEND * min((way for way in ways if way > SAME_POINT), default=0.0)
 
 
 def _timing_in(world: TaskWorld, timing: Timing) -> Timing:

@@ -16,8 +16,9 @@ from apex_ompl.constraints.frames import LinkFace, frame_of
 from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
-from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import AnyStep, GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep
+from apex_ompl.ompl.setup import workspace_goal
+from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
+from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 
@@ -86,6 +87,24 @@ class TaskWorld:
         pose = self.robot.link_pose(q, fixed.link)
         return pose[:3, :3] @ fixed.point + pose[:3, 3], pose[:3, :3] @ fixed.axis
 
+    def problem(self, given: Problem, goal: Goal, q: Array) -> Problem:
+        """Return the problem of going on from a state to a further goal.
+
+        Args:
+            given: The problem that the task is part of.
+            goal: The goal.
+            q: The state, shape (dof,).
+        """
+        start = dict(zip(self.robot.joint_names, q.tolist(), strict=True))
+        if goal.joints is not None:
+            goal = Goal(joints=tuple(start | dict(values) for values in goal.joints))
+        return given.model_copy(
+            update={
+                "scene": tuple(self.scene.values()), "attached": tuple(self.held.values()),
+                "allowed": tuple(sorted(self.pairs)), "start": start, "goal": goal, "constraints": (), "after": (),
+            }
+        )  # fmt: skip
+
     def after(self, step: AnyStep, q: Array) -> TaskWorld:
         """Return the world after a step that ends in a state, shape (dof,).
 
@@ -152,7 +171,7 @@ def check_steps(robot: Robot, problem: Problem) -> None:
         FileFormatError: A hand, a frame or an object is unknown, or a hand does not hold what it is to release; the
             message names the step.
     """
-    world, q = TaskWorld.of(robot, problem), problem.start_state(robot.joint_names)
+    world, q = TaskWorld.of(robot, problem), robot.within_limits(problem.start_state(robot.joint_names))
     if problem.after and problem.moving:
         raise FileFormatError(
             problem.source, "after", problem.moving[0], "expected no steps after the goal beside an obstacle that moves"
@@ -160,13 +179,22 @@ def check_steps(robot: Robot, problem: Problem) -> None:
     for k, step in enumerate(problem.after):
         for name, value, expected in _faults(world, step):
             raise FileFormatError(problem.source, f"after.{k}.{name}", value, expected)
+        if isinstance(step, MoveStep):
+            moved = world.problem(problem, step.goal, q)
+            try:
+                workspace_goal(robot, moved)
+                moved.goal_states(robot.joint_names)
+            except ApexError as error:
+                raise FileFormatError(problem.source, f"after.{k}.goal", str(error), "expected a possible goal") from None
         world = world.after(step, q)
 
 
 def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]]:
     """Yield field, value and what was expected, for each fault of a step."""
     robot = world.robot
-    if not isinstance(step, LineStep):
+    if isinstance(step, MoveStep):
+        return
+    if not isinstance(step, LineStep | TurnStep):
         hand = getattr(step, "hand", None)
         if hand is not None and hand not in robot.hands:
             yield "hand", hand, f"expected a hand: {', '.join(robot.hands) or 'the robot has none'}"
@@ -189,14 +217,14 @@ def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]
         except UnknownNameError as error:
             yield "frame", name, f"expected a hand, a link or an object that is held then: {', '.join(error.known)}"
             return
-        if step.gap is not None and name not in world.held:
+        if isinstance(step, LineStep) and step.gap is not None and name not in world.held:
             yield "gap", step.gap, f"expected none, since {name!r} is no held object"
-    q = robot.home
-    for name in (step.frame[0], step.onto) if step.onto is not None else ():
+    q, onto = robot.home, step.onto if isinstance(step, LineStep) else None
+    for name in (step.frame[0], onto) if onto is not None else ():
         if world.face(name, q) is None:
             known = name in world.held or name in world.scene
             expected = "a contact face" if known else "a hand, or a held or released object,"
-            yield "onto" if name == step.onto else "frame", name, f"expected {expected} to align"
+            yield "onto" if name == onto else "frame", name, f"expected {expected} to align"
 
 
 def _grasp_faults(world: TaskWorld, step: GraspStep) -> Iterable[tuple[str, object, str]]:

@@ -8,10 +8,11 @@ reasons for which goals were rejected are counted.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from math import nan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,33 +27,60 @@ from apex_ompl.planning.task_steps import StepFailed, StepPlan, StepPlanner
 from apex_ompl.planning.task_world import TaskWorld, check_steps
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
+from apex_ompl.robot.model import digest
 from apex_ompl.robot.rest_to_rest import direct_durations
-from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import GraspStep, ReleaseStep
 from apex_ompl.timing import Timing
 from apex_ompl.timing.trajectory import joined
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
+from apex_ompl.util.forking import unforked
 from apex_ompl.util.process import running
 
 WANTED = 3  # goals from which all steps can be done, among which the planner chooses
 EXAMINATION = 0.5  # of the time, at most, for the search for these goals once one is found
+PER_GOAL = 0.5  # of the timeout, for the steps from one goal
 ROUNDS = 50  # of sampling goals
+MOST_CAUSES = 3  # that a reason names
 LEAST_TIME = 1e-3  # of a plan [s]
 WORDS = "no goal was found from which the steps after it can be done"
 
-PlanTo = Callable[[Problem, float], PlanResult]
-"""Plans a problem in a time [s]."""
+PlanTo = Callable[[Problem, float, bool], PlanResult]
+"""Plans a problem in a time [s]; with True the first motion of the task, which alone has constraints along it."""
+
+
+class Stage(NamedTuple):
+    """A motion to a goal, and the steps after it up to the next such motion.
+
+    Attributes:
+        move: The motion; its goal is that of the problem for the first one.
+        steps: The steps.
+    """
+
+    move: MoveStep
+    steps: tuple[AnyStep, ...]
+
+
+def stages(problem: Problem) -> list[Stage]:
+    """Return the stages of a task."""
+    found = [Stage(MoveStep(goal=problem.goal), ())]
+    for step in problem.after:
+        if isinstance(step, MoveStep):
+            found.append(Stage(step, ()))
+        else:
+            found[-1] = found[-1]._replace(steps=(*found[-1].steps, step))
+    return found
 
 
 def plan_task(checker: CollisionChecker, problem: Problem, options: PlanOptions, plan_to: PlanTo) -> TaskResult:
     """Return the plan of a whole task: what :meth:`apex_ompl.MotionPlanner.plan_task` returns.
 
     Args:
-        checker: Collision checker with the bodies of the problem.
+        checker: Collision checker with the bodies of the problem, which it has again at the end.
         problem: The problem.
         options: The options of the plan.
-        plan_to: Plans the same problem to other goals.
+        plan_to: Plans from goal to goal.
 
     Raises:
         ApexError: The problem, a step or an option is faulty.
@@ -60,68 +88,174 @@ def plan_task(checker: CollisionChecker, problem: Problem, options: PlanOptions,
     """
     options.check()
     check_steps(checker.robot, problem)
-    deadline = Deadline(options.timeout)
-    setup = assemble(
-        problem, checker.robot, seed=options.seed, group=options.group, checker=checker, constraints=options.constraints
-    )
-    start_fault = setup.start_fault and not options.leave_contact
-    if start_fault or setup.start_off or (query_fault(setup)[0] is not None and not setup.start_fault):
-        return TaskResult.of(plan_to(problem, options.timeout))
-    timing = Timing() if options.timing is True else options.timing or None
-    return TaskPlanner(setup, timing, deadline).plan(plan_to)
+    task = TaskPlanner(checker, problem, options, plan_to)
+    try:
+        return task.plan()
+    finally:
+        checker.become(task.world.scene, task.world.held, task.world.pairs)
 
 
 class TaskPlanner:
     """Plans one task.
 
     Attributes:
+        world: The world on the way to the goal.
         rejected: Why steps after a goal could not be done -> number of goals.
         examined: Number of goals from which the steps were tried.
     """
 
-    def __init__(self, setup: PlanningSetup, timing: Timing | None, deadline: Deadline) -> None:
-        """Plan the task of a problem.
-
-        Args:
-            setup: The problem; its start and a goal are valid.
-            timing: How motions are timed, or None for paths alone.
-            deadline: When the plan is to be ready.
-        """
-        self.setup, self.timing, self.deadline = setup, timing, deadline
-        self.problem, self.robot = setup.problem, setup.robot
-        self.world = TaskWorld.of(self.robot, self.problem)
-        bodies = self.world.scene.values(), self.world.held.values(), self.world.allowed
-        self.steps = StepPlanner(CollisionChecker(self.robot, *bodies), self.problem, deadline, self._ends)
+    def __init__(
+        self, checker: CollisionChecker, problem: Problem, options: PlanOptions, plan_to: PlanTo
+    ) -> None:  # fmt: skip
+        """Plan the task of a problem; see :func:`plan_task`."""
+        self._checker, self._problem, self._options, self._plan_to = checker, problem, options, plan_to
+        self._timing = Timing() if options.timing is True else options.timing or None
+        self._deadline, self._interrupt = Deadline(options.timeout), Interrupt()
+        self._stages, self._times = stages(problem), {"steps": 0.0}
+        self.world = TaskWorld.of(checker.robot, problem)
         self.rejected, self.examined = Counter[str](), 0
-        self._times: dict[str, float] = {"steps": 0.0}
-        self._interrupt = Interrupt()
+        bodies = self.world.scene.values(), self.world.held.values(), self.world.allowed
+        mine = CollisionChecker(checker.robot, *bodies)
+        self._steps = StepPlanner(mine, problem, self._deadline, lambda: self._interrupt.pressed)
 
-    def plan(self, plan_to: PlanTo) -> TaskResult:
-        """Return the plan of the whole task.
+    def plan(self) -> TaskResult:
+        """Return the plan of the whole task."""
+        given = self._options
+        setup = assemble(
+            self._problem, self._checker.robot, seed=given.seed, group=given.group, checker=self._checker,
+            constraints=given.constraints,
+        )  # fmt: skip
+        fault = query_fault(setup)[0]
+        leaves = given.leave_contact and setup.start_fault
+        if fault is not None and not leaves:
+            return TaskResult.of(self._plan_to(self._problem, given.timeout, True))
+        try:
+            found, plans = self._solved(0, self.world, setup)
+        except NotPlannedError as failure:
+            return self._said(TaskResult.of(failure.result))
+        except StepFailed as failure:
+            return self._failed(str(failure))
+        return self._said(_whole(found, plans, self._checker.robot, self._problem))
+
+    def _solved(self, k: int, world: TaskWorld, setup: PlanningSetup) -> tuple[PlanResult, list[StepPlan]]:
+        """Return the plan to the goal of a stage, and those of all steps after it.
 
         Args:
-            plan_to: Plans to goal states.
+            k: Number of the stage.
+            world: The world at its start.
+            setup: The problem of its motion.
+
+        Raises:
+            NotPlannedError: The planner found no motion to the goal of the first stage.
+            StepFailed: It, or one after it, cannot be done.
         """
+        stage = self._stages[k]
         with self._interruptible():
-            goals = self._goals() if self.problem.after else list(self.setup.valid_goals)
+            goals = self._goals(setup, world, stage.steps)
         while goals:
-            found = plan_to(self._to(goals), max(self.deadline.remaining - self.deadline.reserve, LEAST_TIME))
+            time = max(self._deadline.remaining - self._deadline.reserve, LEAST_TIME)
+            self._checker.become(world.scene, world.held, world.pairs)
+            found = self._plan_to(self._to(setup.problem, goals), time, k == 0)
             if not found or found.path is None:
-                return self._said(TaskResult.of(found))
+                if k == 0:
+                    raise NotPlannedError(found)
+                raise StepFailed(f"{stage.move.title}: {found.reason}", f"{stage.move.title}: {found.status}")
             reached = found.path.states[-1]
             try:
                 with self._interruptible():
-                    timing = None if found.trajectory is None else self.timing
-                    plans = self.steps.follow(self.world, reached, timing)
+                    plans = self._steps.follow(stage.steps, world, reached, self._timing, self._deadline)
+                return found, plans + self._further(k + 1, plans[-1].after if plans else world, _end(plans, reached))
             except StepFailed as failure:
-                self.rejected[str(failure)] += 1
+                self.rejected[failure.cause] += 1
                 goals = [goal for goal in goals if not np.array_equal(goal, reached)]
-                continue
-            return self._said(_whole(found, plans, self.robot, self.problem))
-        return self._failed()
+        raise StepFailed(WORDS)
 
-    def _ends(self) -> bool:
-        return self._interrupt.pressed or self.deadline.expired
+    def _further(self, k: int, world: TaskWorld, q: Array) -> list[StepPlan]:
+        """Return the plans of a stage and those after it, from a state, shape (dof,); none after the last one.
+
+        Raises:
+            StepFailed: One cannot be done.
+        """
+        if k == len(self._stages):
+            return []
+        move = self._stages[k].move
+        problem = world.problem(self._problem, move.goal, q)
+        self._checker.become(world.scene, world.held, world.pairs)
+        with unforked(), quiet_ompl():
+            setup = assemble(problem, self._checker.robot, seed=self._options.seed, checker=self._checker)
+        status, reason, _ = query_fault(setup)
+        if status is not None:
+            raise StepFailed(f"{move.title}: {reason}", f"{move.title}: {status}")
+        found, plans = self._solved(k, world, setup)
+        assert found.path is not None
+        clearance = found.clearance if found.trajectory is None else found.motion_clearance
+        deviation = 0.0 if found.trajectory is None else found.deviation
+        plan = StepPlan(
+            move, world, world, found.path, found.trajectory, clearance, use=found.limit_use, deviation=deviation
+        )
+        return [plan, *plans]
+
+    def _goals(self, setup: PlanningSetup, world: TaskWorld, steps: Sequence[AnyStep]) -> list[Array]:
+        """Return goals from which steps can be done, the nearest first: a few, or all where there is no step."""
+        if not steps:
+            return list(setup.valid_goals)
+        found, timeout = list[Array](), self._deadline.timeout
+        until = self._deadline.remaining * (1.0 - EXAMINATION)
+        for goal in self._candidates(setup):
+            late = self._deadline.remaining <= until
+            if self._interrupt.pressed or self._deadline.for_search <= 0.0 or (found and late):
+                break
+            self.examined += 1
+            try:
+                time = min(PER_GOAL * timeout, self._deadline.remaining)
+                self._steps.follow(steps, world, goal, None, Deadline(time))
+            except StepFailed as failure:
+                self.rejected[failure.cause] += 1
+                continue
+            found.append(goal)
+            if len(found) == WANTED:
+                break
+        return found
+
+    def _candidates(self, setup: PlanningSetup) -> Iterator[Array]:
+        """Yield goals, the nearest first; then others that are sampled, where the goal is in the workspace."""
+        robot, goals = setup.robot, setup.valid_goals
+        yield from goals[np.argsort(direct_durations(setup.start, goals, robot.limits), kind="stable")]
+        goal = workspace_goal(robot, setup.problem)
+        if goal is None or setup.constraints is not None or len(setup.held):
+            return
+        rng = np.random.default_rng([setup.seed, 1])
+        for _ in range(ROUNDS):
+            yield from sample(goal, setup.checker, rng, GOAL_STATES, GOAL_ATTEMPTS).states
+
+    def _to(self, problem: Problem, goals: list[Array]) -> Problem:
+        """Return a problem with goal states in place of its goal."""
+        names = self._checker.robot.joint_names
+        states = tuple(dict(zip(names, goal.tolist(), strict=True)) for goal in goals)
+        return problem.model_copy(update={"goal": Goal(joints=states), "after": ()})
+
+    def _said(self, result: TaskResult) -> TaskResult:
+        """Return a result of the given problem, with the goals that were examined."""
+        steps = self._times["steps"]
+        times = {**result.times, "steps": steps, "total": result.times.get("total", 0.0) + steps}
+        return replace(
+            result, problem=self._problem, times=times, goals_examined=self.examined,
+            goals_rejected=dict(self.rejected), checks=result.checks + self._steps.checker.check_counts.states,
+        )  # fmt: skip
+
+    def _failed(self, reason: str) -> TaskResult:
+        """Return the result of a task whose steps cannot be done."""
+        counts = self.rejected.most_common(MOST_CAUSES)
+        causes = "; ".join(f"{cause} ({n} of {self.examined} goals)" for cause, n in counts)
+        if self._deadline.for_search <= 0.0:
+            reason = f"{reason} in {self._options.timeout:g} s"
+        robot = self._checker.robot
+        made = TaskResult(
+            status=PlanStatus.STEP_FAILED, reason=f"{reason}; {causes}" if causes else reason, problem=self._problem,
+            robot=robot.name, joint_names=robot.joint_names, planner="task", seed=self._options.seed,
+            robot_digest=digest(robot),
+        )  # fmt: skip
+        return self._said(made)
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
@@ -129,60 +263,23 @@ class TaskPlanner:
         with Interrupt() as self._interrupt, running(self._interrupt.end), timed(self._times, "steps"), quiet_ompl():
             yield
 
-    def _said(self, result: TaskResult) -> TaskResult:
-        """Return a result of the given problem, with the goals that were examined."""
-        times = {**result.times, "steps": self._times["steps"]}
-        times["total"] = times.pop("total", 0.0) + self._times["steps"]
-        return replace(
-            result, problem=self.problem, times=times, goals_examined=self.examined, goals_rejected=dict(self.rejected),
-            checks=result.checks + self.steps.checker.check_counts.states,
-        )  # fmt: skip
 
-    def _failed(self) -> TaskResult:
-        causes = "; ".join(f"{reason} ({n} of {self.examined})" for reason, n in self.rejected.most_common(3))
-        late = self._ends() or self.deadline.for_search <= 0.0
-        reason = f"{WORDS}{' in time' if late else ''}: {causes or 'none was examined'}"
-        made = TaskResult(
-            status=PlanStatus.STEP_FAILED, reason=reason, problem=self.problem, robot=self.robot.name,
-            joint_names=self.robot.joint_names, planner="task", seed=self.setup.seed,
-        )  # fmt: skip
-        return self._said(made)
+class NotPlannedError(Exception):
+    """The planner found no motion to the goal of a problem.
 
-    def _to(self, goals: list[Array]) -> Problem:
-        """Return the problem with goal states in place of its goal."""
-        names = self.robot.joint_names
-        states = tuple(dict(zip(names, goal.tolist(), strict=True)) for goal in goals)
-        return self.problem.model_copy(update={"goal": Goal(joints=states), "after": ()})
+    Attributes:
+        result: What it returned.
+    """
 
-    def _goals(self) -> list[Array]:
-        """Return goals from which all steps can be done, the nearest first."""
-        found, share = list[Array](), EXAMINATION * self.deadline.timeout
-        for goal in self._candidates():
-            late = self.deadline.remaining <= self.deadline.timeout - share
-            if self._ends() or self.deadline.for_search <= 0.0 or (found and late):
-                break
-            self.examined += 1
-            try:
-                self.steps.follow(self.world, goal, None)
-            except StepFailed as failure:
-                self.rejected[str(failure)] += 1
-                continue
-            found.append(goal)
-            if len(found) == WANTED:
-                break
-        return found
+    def __init__(self, result: PlanResult) -> None:
+        """Keep the result."""
+        super().__init__(result.reason)
+        self.result = result
 
-    def _candidates(self) -> Iterator[Array]:
-        """Yield goals, the nearest first; then others that are sampled, where the goal is in the workspace."""
-        goals = self.setup.valid_goals
-        durations = direct_durations(self.setup.start, goals, self.robot.limits)
-        yield from goals[np.argsort(durations, kind="stable")]
-        goal = workspace_goal(self.robot, self.problem)
-        if goal is None or self.setup.constraints is not None or len(self.setup.held):
-            return
-        rng = np.random.default_rng([self.setup.seed, 1])
-        for _ in range(ROUNDS):
-            yield from sample(goal, self.setup.checker, rng, GOAL_STATES, GOAL_ATTEMPTS).states
+
+def _end(plans: Sequence[StepPlan], q: Array) -> Array:
+    """Return the state after steps, or the one before them, shape (dof,), where there are none."""
+    return plans[-1].end if plans else q
 
 
 def _whole(found: PlanResult, plans: list[StepPlan], robot: Robot, problem: Problem) -> TaskResult:

@@ -18,7 +18,16 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_v
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
-from apex_ompl.scene.steps import AnyStep
+from apex_ompl.scene.steps import (
+    GraspStep,
+    HandStep,
+    LineStep,
+    ReleaseStep,
+    RetreatStep,
+    Step,
+    TurnStep,
+    WaitStep,
+)
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
@@ -145,6 +154,34 @@ class Goal(StrictModel):
         if twice:
             raise ValueError(f"more than one pose is given for {twice[0]!r}")
         return self
+
+
+class MoveStep(Step):
+    """A motion to a further goal, by the planner.
+
+    Attributes:
+        goal: The goal; joints that one by joint names leaves out stay.
+    """
+
+    kind: Literal["move"] = "move"
+    goal: Goal
+
+    @property
+    def subject(self) -> str:
+        """What is moved, or the kind of goal."""
+        if self.goal.poses is not None:
+            return " and ".join(pose.frame for pose in self.goal.poses)
+        if self.goal.alignment is None:
+            return "joints"
+        sides = self.goal.alignment.first, self.goal.alignment.second
+        return " and ".join(one.link if isinstance(one, WorldVector) else one for one in sides)
+
+
+AnyStep = Annotated[
+    MoveStep | LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep,
+    Field(discriminator="kind"),
+]
+"""A step after the goal in a problem file."""
 
 
 class Problem(StrictModel):

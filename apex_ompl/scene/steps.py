@@ -1,4 +1,4 @@
-"""Steps after the goal of a problem: what problem files write as ``after``.
+"""Steps after the goal of a problem: what problem files write as ``after``, but for ``move``, which has a goal of its own.
 
 Each starts at rest in the last state of the one before it, and ends at rest. A frame is named after a hand, a link or
 a held object, see :func:`apex_ompl.constraints.frames.frame_of`. Lengths are in meters, the world has z up.
@@ -61,9 +61,9 @@ class LineStep(Step):
     """A straight line of frames by a displacement, or of a contact face to one that it is then aligned with.
 
     Attributes:
-        frame: The frame, or several that go by the same displacement, in step.
+        frame: The frame, or several that go by the displacement at once, in step.
         by: Displacement; orientations are kept [m].
-        axes: Axes of the displacement: those of the ``world``, or of the ``frame`` itself at the start of the line.
+        axes: Axes of the displacement: those of the ``world``, or of each ``frame`` itself at the start of the line.
         gap: With ``by``: the line ends before its end where a held object that moves would come nearer than this to an
             obstacle or another held object [m].
         onto: Held or released object, or hand, whose contact face that of ``frame`` is brought to: with opposite axes,
@@ -106,6 +106,33 @@ class LineStep(Step):
     def subject(self) -> str:
         """The frames, and where to."""
         return " and ".join(self.frame) + (f" onto {self.onto}" if self.onto is not None else "")
+
+
+class TurnStep(Step):
+    """Frames turn together, as one rigid body, about the origin of the first.
+
+    Attributes:
+        frame: The frame, or several, such as a cup in one hand and what is above it in the other.
+        to: Direction in the world that the z axis of the first frame is brought to, by the shortest turn; of a held
+            object with a contact face this is the outward axis of the face.
+        speed: Largest speed of the frames; by default the limits of the joints alone count [m/s].
+    """
+
+    kind: Literal["turn"] = "turn"
+    frame: Names
+    to: Direction
+    speed: Size | None = None
+
+    @model_validator(mode="after")
+    def _differ(self) -> Self:
+        if len(set(self.frame)) < len(self.frame):
+            raise ValueError("expected frames that differ")
+        return self
+
+    @property
+    def subject(self) -> str:
+        """The frames."""
+        return " and ".join(self.frame)
 
 
 class HandStep(Step):
@@ -208,8 +235,3 @@ class WaitStep(Step):
         """The time."""
         return f"{self.seconds:g} s"
 
-
-AnyStep = Annotated[
-    LineStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep, Field(discriminator="kind")
-]
-"""A step in a problem file."""
