@@ -23,17 +23,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
+from apex_ompl.collision.mass import per_mass
+from apex_ompl.collision.shapes import coal_geometry, is_shell
 from apex_ompl.drivers import Twin, TwinSettings
+from apex_ompl.drivers.twin import with_mass
 from apex_ompl.errors import SceneError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.config import DATA
-from apex_ompl.scene.bodies import AttachedObject, pose_fields, pose_matrix
+from apex_ompl.scene.bodies import AttachedObject, MeshFile, pose_fields, pose_matrix
+from apex_ompl.scene.meshes import triangles
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
@@ -103,6 +108,26 @@ def felt_gravity(problem: Problem, held: AttachedObject, seed: int) -> Array:
     return np.einsum("nji,nj->ni", poses[:, :3, :3], GRAVITY - acceleration)
 
 
+def outside(held: AttachedObject) -> AttachedObject:
+    """Return an object with the convex hull of its mesh, which fingers touch, and with its own mass."""
+    mesh = coal_geometry(held)
+    if held.mesh is None or not is_shell(mesh):
+        return held.model_copy(update={"contact": None})
+    center, inertia = per_mass(held)
+    heavy = with_mass(held, TwinSettings().density)
+    assert heavy.mass is not None
+    hull = trimesh.convex.convex_hull(triangles(mesh)[0])
+    file = Path(tempfile.mkdtemp()) / "hull.obj"
+    hull.export(file)
+    moments = heavy.mass * inertia[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    return heavy.model_copy(
+        update={
+            "contact": None, "mesh": MeshFile(file=str(file)), "center_of_mass": tuple(center.tolist()),
+            "inertia": tuple(moments.tolist()),
+        }
+    )  # fmt: skip
+
+
 class Search:
     """Candidates for an object of a problem.
 
@@ -116,7 +141,7 @@ class Search:
         self.held, self.hand = held, next(n for n, h in robot().hands.items() if h.palm == held.link)
         self.robot = hand_robot(self.hand.split("_")[0])
         self.synergy = str(self.robot.hands[self.hand].synergy)
-        own = held.model_copy(update={"contact": None})
+        own = outside(held)
         start = {self.synergy: 0.0}
         pairs = tuple(combinations(self.robot.link_names[1:], 2))
         alone = Problem(

@@ -20,7 +20,7 @@ from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun
 from apex_ompl.physics.trials import Trial
 from apex_ompl.planning.task_result import TaskResult, TaskStep
 from apex_ompl.robot import Robot
-from apex_ompl.scene.steps import AnyStep, GraspStep, ReleaseStep
+from apex_ompl.scene.steps import GraspStep, ReleaseStep, Step
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -62,7 +62,7 @@ def rehearsed(robot: Robot, trial: Trial, motion: Trajectory, settings: TwinSett
             slips[name] = max(most, off), max(angle, turned(now, first[name]))
 
     _advance(driver, driver.time + SETTLING, watch)
-    driver.send(motion, driver.time)
+    driver.send(motion, max(driver.time, driver.end))
     _advance(driver, driver.end + SETTLING, watch)
     return frozenset(name for name, (off, angle) in slips.items() if off <= SLIP and angle <= SLIP_ANGLE)
 
@@ -109,7 +109,7 @@ class Executor:
         standing = self._standing()
         driver.forget()
         lost = [one for one in self.grasps.found if one.kind == LOOSE and not self._carried(one.object)]
-        after: list[AnyStep | None] = [None, *self.plan.problem.after]
+        after: list[Step | None] = [None, *self.plan.problem.after]
         for planned, step in zip(self.plan.steps, after, strict=True):
             self._follow(planned, step, part_of(motion, planned.start, planned.end))
         self._wait(RESTING)
@@ -122,12 +122,12 @@ class Executor:
         held = {one.name: one for one in self.trial.known.attached}
         return held[name].touch_links == () or held[name].links is not None
 
-    def _follow(self, planned: TaskStep, step: AnyStep | None, motion: Trajectory) -> None:
+    def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:
         driver, begin = self.driver, self.driver.time
         if isinstance(step, ReleaseStep):
             self.grasps.open(step.hand)
         if motion.duration > 0.0:
-            driver.send(motion, driver.time)
+            driver.send(motion, max(driver.time, driver.end))
             self._to(driver.end)
         if isinstance(step, ReleaseStep):
             self.grasps.release(planned.released, step.hand, self._to)
@@ -200,7 +200,8 @@ def _advance(driver: MujocoDriver, until: float, watch: Callable[[], None]) -> N
 
 def part_of(motion: Trajectory, start: float, end: float) -> Trajectory:
     """Return the part of a motion between two of its knots [s]."""
-    inside = (motion.times >= start - 1e-9) & (motion.times <= end + 1e-9)
+    first, last = (int(np.argmin(np.abs(motion.times - time))) for time in (start, end))
+    inside = slice(first, last + 1)
     times = motion.times[inside]
     return Trajectory(
         times - times[0], motion.positions[inside], motion.velocities[inside], motion.accelerations[inside],
