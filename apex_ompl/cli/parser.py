@@ -153,6 +153,7 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "--calm-factor", type=float, default=1.1, metavar="FACTOR",
         help="duration of a calm motion as a multiple of the fastest one's (default: %(default)s)",
     )  # fmt: skip
+    parser.add_argument("--to-goal", action="store_true", help="leave out the steps after the goal")
     parser.add_argument("--no-timing", action="store_true", help="leave the path without times")
     parser.add_argument(
         "--timing-method", default="ruckig", metavar="NAME",

@@ -9,11 +9,13 @@ from dataclasses import dataclass, field, fields, replace
 from math import isnan, nan
 from typing import Any
 
-from apex_ompl.errors import ApexError, FileFormatError
+from apex_ompl.errors import ApexError, FileFormatError, ParameterError
 from apex_ompl.paths.path import Path
 from apex_ompl.result import PlanResult
+from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
 from apex_ompl.util.files import BROKEN, read_archive
 from apex_ompl.util.schema import StrictModel, read_json, read_yaml, validate
@@ -29,6 +31,7 @@ class _Bodies(StrictModel):
     scene: tuple[Obstacle, ...] = ()
     attached: tuple[AttachedObject, ...] = ()
     allowed: tuple[tuple[str, str], ...] = ()
+    leaving: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +48,9 @@ class TaskStep:
         scene: Obstacles during it, released objects among them.
         attached: Objects held during it.
         allowed: Pairs of bodies that may touch during it.
-        left: Time from which on a retreating hand no longer touches what it released, or without a motion the number of
-            the state of ``path``; NaN of other steps. It is proved clear of it from then on, and until then the pair is
-            among ``allowed``.
+        left: Time from which on a retreating hand is proved clear of what it released, or without a motion the number
+            of the state of ``path``; NaN of other steps.
+        leaving: Pairs among ``allowed`` that may touch until then only.
         released: Objects that its hand lets go of.
         grasped: Objects that its hand takes.
         gone: Released objects that planning no longer knows of from its end on, since they fall.
@@ -63,6 +66,7 @@ class TaskStep:
     attached: tuple[AttachedObject, ...]
     allowed: tuple[tuple[str, str], ...]
     left: float = nan
+    leaving: tuple[tuple[str, str], ...] = ()
     released: tuple[str, ...] = ()
     grasped: tuple[str, ...] = ()
     gone: tuple[str, ...] = ()
@@ -94,6 +98,7 @@ class TaskStep:
             "grasped": list(self.grasped), "gone": list(self.gone), "path": self.path.states.tolist(),
             "scene": [_plain(one) for one in changed], "removed": removed,
             "attached": [_plain(one) for one in self.attached], "allowed": [list(pair) for pair in self.allowed],
+            "leaving": [list(pair) for pair in self.leaving],
         }  # fmt: skip
 
     @classmethod
@@ -104,13 +109,14 @@ class TaskStep:
             ApexError: A body is faulty.
             KeyError, TypeError, ValueError: A field is missing or faulty.
         """
-        given = {name: data[name] for name in ("scene", "attached", "allowed")}
+        given = {name: data[name] for name in ("scene", "attached", "allowed", "leaving")}
         bodies = validate(_Bodies, given, source)
         changed, removed = {one.name: one for one in bodies.scene}, set(data["removed"])
         scene = {one.name: one for one in problem.scene if one.name not in removed} | changed
         return cls(
             kind=str(data["kind"]), title=str(data["title"]), path=Path(finite_array(data["path"], "path")),
             scene=tuple(scene.values()), attached=bodies.attached, allowed=bodies.allowed,
+            leaving=bodies.leaving,
             **{name: tuple(map(str, data[name])) for name in ("released", "grasped", "gone")},  # type: ignore[arg-type]
             **{n: nan if data[n] is None else float(data[n]) for n in ("start", "end", "clearance", "left")},  # type: ignore[arg-type]
         )  # fmt: skip
@@ -139,6 +145,17 @@ class TaskResult(PlanResult):
         titles = ", ".join(step.title for step in self.steps)
         return one_line("TaskResult", str(self.status), repr(self.problem.name), titles, motion, self.reason)
 
+    def _step_rows(self) -> list[tuple[str, str]]:
+        """Return a line on each step."""
+        rows = []
+        for step in self.steps:
+            change = f", {step.change}" if step.change else ""
+            rows.append(("step", f"{step.title}: {step.interval}, {1e3 * step.clearance:.2f} mm clear{change}"))
+        if self.goals_examined:
+            rejected = sum(self.goals_rejected.values())
+            rows.append(("goals", f"{self.goals_examined} examined, {rejected} rejected"))
+        return rows
+
     @classmethod
     def of(cls, result: PlanResult) -> TaskResult:
         """Return the result of a plan to a goal as that of a task without steps."""
@@ -148,6 +165,39 @@ class TaskResult(PlanResult):
     def goal_time(self) -> float:
         """Time at which the goal is reached [s]; NaN without a motion."""
         return self.steps[0].end if self.steps else nan
+
+    def step_at(self, time: float) -> TaskStep:
+        """Return the step at a time [s]: the first one before the start, the last one after the end.
+
+        Raises:
+            ParameterError: The task was not planned, or is not timed.
+        """
+        if not self.steps or isnan(self.goal_time):
+            raise ParameterError("result", str(self.status), "a task with a timed motion")
+        return next((step for step in self.steps if time < step.end), self.steps[-1])
+
+    def object_poses(self, robot: Robot, time: float) -> dict[str, Array | None]:
+        """Return the poses in the world of all objects that are held at some time, shape (4, 4); None of fallen ones.
+
+        Args:
+            robot: The robot of the problem.
+            time: A time of the motion [s].
+
+        Raises:
+            ParameterError: The task was not planned, or is not timed.
+        """
+        step, motion = self.step_at(time), self.trajectory
+        assert motion is not None
+        over = step is self.steps[-1] and time >= step.end  # what falls at the end of the last step is gone then
+        held, q = {one.name: one for one in step.attached}, motion(time)
+        standing = {one.name: one.pose for one in step.scene}
+        found: dict[str, Array | None] = {}
+        for name in dict.fromkeys(one.name for some in self.steps for one in some.attached):
+            if name in held and not (over and name in step.gone):
+                found[name] = robot.link_pose(q, held[name].link) @ held[name].pose
+            else:
+                found[name] = standing.get(name)
+        return found
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON."""
@@ -164,10 +214,7 @@ class TaskResult(PlanResult):
         """
         found, file = super().load(path), os.fspath(path)
         assert isinstance(found, TaskResult)
-        if file.endswith(".npz"):
-            data = read_archive(pathlib.Path(file), "result", "result file")[0]
-        else:
-            data = (read_json if file.endswith(".json") else read_yaml)(pathlib.Path(file), "result file")
+        data = _data_of(file)
         try:
             task = data["task"]
             steps = tuple(TaskStep.of_dict(one, found.problem, file) for one in task["steps"])
@@ -175,6 +222,24 @@ class TaskResult(PlanResult):
             return replace(found, steps=steps, goals_examined=int(task["goals_examined"]), goals_rejected=rejected)
         except (*BROKEN, ApexError, AttributeError) as error:
             raise FileFormatError(file, "task", str(error), "expected the result of a task") from error
+
+
+def load_result(path: str | os.PathLike[str]) -> PlanResult:
+    """Read a saved result of a plan, or that of a task as a :class:`TaskResult`.
+
+    Raises:
+        ApexError: As :meth:`apex_ompl.PlanResult.load`.
+    """
+    found = PlanResult.load(path)
+    return TaskResult.load(path) if "task" in _data_of(os.fspath(path)) else found
+
+
+def _data_of(file: str) -> dict[str, Any]:
+    """Return the record of a saved result."""
+    if file.endswith(".npz"):
+        return read_archive(pathlib.Path(file), "result", "result file")[0]
+    data: dict[str, Any] = (read_json if file.endswith(".json") else read_yaml)(pathlib.Path(file), "result file")
+    return data
 
 
 def _number(value: float) -> float | None:

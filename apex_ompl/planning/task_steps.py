@@ -36,6 +36,7 @@ MOST_ADVANCES = 500
 ARC = np.radians(5.0)  # of a turn that a straight line replaces [rad]
 LATE = "the time is over"
 BLEND = 0.4  # of the way between two poses of a turn
+HAND_ROOM = 1e-4  # to the limits of a synergy, which motions at another rate need at rests
 DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
 EXAMINED = 50  # states at which that is examined
 
@@ -95,7 +96,9 @@ class StepPlanner:
         problem: The problem.
     """
 
-    def __init__(self, checker: CollisionChecker, problem: Problem, deadline: Deadline, pressed: Callable[[], bool]) -> None:
+    def __init__(
+        self, checker: CollisionChecker, problem: Problem, deadline: Deadline, pressed: Callable[[], bool]
+    ) -> None:
         """Plan by ``checker`` until a deadline, or until ``pressed`` holds."""
         self.checker, self.problem = checker, problem
         self._deadline, self._pressed = deadline, pressed
@@ -266,7 +269,9 @@ class StepPlanner:
                 to = self._closed(during, step, q)
         end = q.copy()
         if synergy is not None and to is not None:
-            end[self.robot.joint_names.index(synergy)] = to
+            k, limits = self.robot.joint_names.index(synergy), self.robot.limits
+            wanted = float(np.clip(to, limits.lower[k] + HAND_ROOM, limits.upper[k] - HAND_ROOM))
+            end[k] = q[k] if abs(wanted - q[k]) <= HAND_ROOM else wanted
         states = np.stack([q, end]) if (end != q).any() else q[None]
         self._become(during)
         check = full_check(self.checker, states, q, [end], deadline=self._deadline.at)
@@ -313,9 +318,7 @@ class StepPlanner:
             return check.reason
 
         try:
-            made = time_path(
-                states, limits, self.robot.joint_names, how, fault, stop=self._ends, motion_limits=more
-            )
+            made = time_path(states, limits, self.robot.joint_names, how, fault, stop=self._ends, motion_limits=more)
         except TimingError as error:
             raise StepFailed(f"it cannot be timed, {error}") from None
         motion = made.trajectory
@@ -411,9 +414,7 @@ class StepPlanner:
 def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
     """Return the radius of blends between poses: a share of the shortest way of a frame from one to the next [m]."""
     ways = [
-        length(following[name][:3, 3] - pose[:3, 3])
-        for one, following in pairwise(poses)
-        for name, pose in one.items()
+        length(following[name][:3, 3] - pose[:3, 3]) for one, following in pairwise(poses) for name, pose in one.items()
     ]
     return BLEND * min((way for way in ways if way > SAME_POINT), default=0.0)
 

@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.constraints.frames import LinkFace, frame_of
-from apex_ompl.errors import ApexError, FileFormatError, UnknownNameError
-from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
+from apex_ompl.errors import ApexError, FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl.setup import workspace_goal
+from apex_ompl.planning.line_query import tools_of
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import link_of
+from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep
 from apex_ompl.types import Array
@@ -59,7 +61,8 @@ class TaskWorld:
 
     def leaving_pairs(self, hand: str) -> frozenset[Pair]:
         """Return the pairs of the links of a hand and the objects that it is leaving."""
-        links = hand_links(self.robot, hand)
+        solid = {link_of(self.robot.model, item) for item in self.robot.geometry.geometryObjects}
+        links = [link for link in hand_links(self.robot, hand) if link in solid]
         return frozenset((link, name) for name in self.leaving.get(hand, ()) for link in links)
 
     def held_by(self, hand: str) -> tuple[str, ...]:
@@ -185,32 +188,42 @@ def check_steps(robot: Robot, problem: Problem) -> None:
                 workspace_goal(robot, moved)
                 moved.goal_states(robot.joint_names)
             except ApexError as error:
-                raise FileFormatError(problem.source, f"after.{k}.goal", str(error), "expected a possible goal") from None
+                raise FileFormatError(
+                    problem.source, f"after.{k}.goal", str(error), "expected a possible goal"
+                ) from None
         world = world.after(step, q)
 
 
 def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]]:
     """Yield field, value and what was expected, for each fault of a step."""
+    if isinstance(step, LineStep | TurnStep):
+        yield from _frame_faults(world, step)
+    elif isinstance(step, HandStep | ReleaseStep | GraspStep | RetreatStep):
+        yield from _hand_faults(world, step)
+
+
+def _hand_faults(
+    world: TaskWorld, step: HandStep | ReleaseStep | GraspStep | RetreatStep
+) -> Iterable[tuple[str, object, str]]:
+    hands = world.robot.hands
+    if step.hand not in hands:
+        yield "hand", step.hand, f"expected a hand: {', '.join(hands) or 'the robot has none'}"
+        return
+    if isinstance(step, HandStep) and hands[step.hand].synergy is None:
+        yield "hand", step.hand, "expected a hand that opens and closes"
+    if isinstance(step, GraspStep):
+        yield from _grasp_faults(world, step)
+    if isinstance(step, ReleaseStep):
+        mine = world.held_by(step.hand)
+        if not mine:
+            yield "hand", step.hand, "expected a hand that holds an object then"
+        for name in step.objects or ():
+            if name not in mine:
+                yield "objects", name, f"expected an object that {step.hand} holds then: {', '.join(mine)}"
+
+
+def _frame_faults(world: TaskWorld, step: LineStep | TurnStep) -> Iterable[tuple[str, object, str]]:
     robot = world.robot
-    if isinstance(step, MoveStep):
-        return
-    if not isinstance(step, LineStep | TurnStep):
-        hand = getattr(step, "hand", None)
-        if hand is not None and hand not in robot.hands:
-            yield "hand", hand, f"expected a hand: {', '.join(robot.hands) or 'the robot has none'}"
-            return
-        if isinstance(step, HandStep) and robot.hands[step.hand].synergy is None:
-            yield "hand", step.hand, "expected a hand that opens and closes"
-        if isinstance(step, GraspStep):
-            yield from _grasp_faults(world, step)
-        if isinstance(step, ReleaseStep):
-            mine = world.held_by(step.hand)
-            if not mine:
-                yield "hand", step.hand, "expected a hand that holds an object then"
-            for name in step.objects or ():
-                if name not in mine:
-                    yield "objects", name, f"expected an object that {step.hand} holds then: {', '.join(mine)}"
-        return
     for name in step.frame:
         try:
             frame_of(robot, name, world.held)
@@ -219,9 +232,13 @@ def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]
             return
         if isinstance(step, LineStep) and step.gap is not None and name not in world.held:
             yield "gap", step.gap, f"expected none, since {name!r} is no held object"
-    q, onto = robot.home, step.onto if isinstance(step, LineStep) else None
+    try:
+        tools_of(robot, step.frame, [frame_of(robot, name, world.held) for name in step.frame])
+    except ParameterError as error:
+        yield "frame", error.value, f"expected {error.expected}"
+    onto = step.onto if isinstance(step, LineStep) else None
     for name in (step.frame[0], onto) if onto is not None else ():
-        if world.face(name, q) is None:
+        if world.face(name, robot.home) is None:
             known = name in world.held or name in world.scene
             expected = "a contact face" if known else "a hand, or a held or released object,"
             yield "onto" if name == onto else "frame", name, f"expected {expected} to align"

@@ -11,27 +11,28 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from math import nan
+from math import isnan, nan
 from typing import NamedTuple
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.goal_sampling import sample
-from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
 from apex_ompl.ompl.process import Interrupt, quiet_ompl
+from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.planner import PlanOptions
 from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepFailed, StepPlan, StepPlanner
 from apex_ompl.planning.task_world import TaskWorld, check_steps
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.robot import Robot
+from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, ReleaseStep
-from apex_ompl.timing import Timing
+from apex_ompl.scene.steps import GraspStep, ReleaseStep, RetreatStep
+from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.trajectory import joined
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
@@ -41,9 +42,8 @@ from apex_ompl.util.process import running
 WANTED = 3  # goals from which all steps can be done, among which the planner chooses
 EXAMINATION = 0.5  # of the time, at most, for the search for these goals once one is found
 PER_GOAL = 0.5  # of the timeout, for the steps from one goal
-ROUNDS = 50  # of sampling goals
+ROUNDS = 7  # of sampling goals, after those of the set-up
 MOST_CAUSES = 3  # that a reason names
-LEAST_TIME = 1e-3  # of a plan [s]
 WORDS = "no goal was found from which the steps after it can be done"
 
 PlanTo = Callable[[Problem, float, bool], PlanResult]
@@ -125,6 +125,7 @@ class TaskPlanner:
             self._problem, self._checker.robot, seed=given.seed, group=given.group, checker=self._checker,
             constraints=given.constraints,
         )  # fmt: skip
+        self._deadline.restart(given.timeout)
         fault = query_fault(setup)[0]
         leaves = given.leave_contact and setup.start_fault
         if fault is not None and not leaves:
@@ -153,7 +154,9 @@ class TaskPlanner:
         with self._interruptible():
             goals = self._goals(setup, world, stage.steps)
         while goals:
-            time = max(self._deadline.remaining - self._deadline.reserve, LEAST_TIME)
+            time = self._deadline.for_search
+            if time <= 0.0:
+                break
             self._checker.become(world.scene, world.held, world.pairs)
             found = self._plan_to(self._to(setup.problem, goals), time, k == 0)
             if not found or found.path is None:
@@ -181,7 +184,7 @@ class TaskPlanner:
         move = self._stages[k].move
         problem = world.problem(self._problem, move.goal, q)
         self._checker.become(world.scene, world.held, world.pairs)
-        with unforked(), quiet_ompl():
+        with unforked(), quiet_ompl(), self._deadline.paused():
             setup = assemble(problem, self._checker.robot, seed=self._options.seed, checker=self._checker)
         status, reason, _ = query_fault(setup)
         if status is not None:
@@ -247,13 +250,12 @@ class TaskPlanner:
         """Return the result of a task whose steps cannot be done."""
         counts = self.rejected.most_common(MOST_CAUSES)
         causes = "; ".join(f"{cause} ({n} of {self.examined} goals)" for cause, n in counts)
+        robot, status = self._checker.robot, PlanStatus.STEP_FAILED
         if self._deadline.for_search <= 0.0:
-            reason = f"{reason} in {self._options.timeout:g} s"
-        robot = self._checker.robot
+            reason, status = f"the task was not planned in {self._options.timeout:g} s", PlanStatus.TIMEOUT
         made = TaskResult(
-            status=PlanStatus.STEP_FAILED, reason=f"{reason}; {causes}" if causes else reason, problem=self._problem,
-            robot=robot.name, joint_names=robot.joint_names, planner="task", seed=self._options.seed,
-            robot_digest=digest(robot),
+            status=status, reason="; ".join(filter(None, [reason, causes])), problem=self._problem, robot=robot.name,
+            joint_names=robot.joint_names, planner="task", seed=self._options.seed, robot_digest=digest(robot),
         )  # fmt: skip
         return self._said(made)
 
@@ -282,6 +284,31 @@ def _end(plans: Sequence[StepPlan], q: Array) -> Array:
     return plans[-1].end if plans else q
 
 
+def task_fault(result: TaskResult, motion: Trajectory) -> str:
+    """Return why a motion with the times of a task's steps is not free in the scenes of these, or an empty text.
+
+    Args:
+        result: The task.
+        motion: A motion such as its own, or that at another rate.
+    """
+    robot = load_robot(result.problem.robot)
+    for step in result.steps:
+        checker = CollisionChecker(robot, step.scene, step.attached, step.allowed)
+        check = full_check(checker, _between(motion, step.start, step.end))
+        if check and not isnan(step.left):
+            for pair in step.leaving:
+                checker.allow(*pair, allowed=False)
+            check = full_check(checker, _between(motion, step.left, step.end))
+        if not check:
+            return f"{step.title}: {check.reason}"
+    return ""
+
+
+def _between(motion: Trajectory, start: float, end: float) -> Trajectory:
+    """Return the part of a motion between two times [s]."""
+    return motion.before(end).after(start)
+
+
 def _whole(found: PlanResult, plans: list[StepPlan], robot: Robot, problem: Problem) -> TaskResult:
     """Return the result of a task from the plan to its goal and the plans of the steps after it."""
     motion, path = found.trajectory, found.path
@@ -304,20 +331,21 @@ def _whole(found: PlanResult, plans: list[StepPlan], robot: Robot, problem: Prob
     return replace(
         result, trajectory=whole, limit_use=use | dict(whole.use(robot.limits)),
         motion_clearance=min(step.clearance for step in steps),
-        deviation=max(found.deviation, *(plan.deviation for plan in plans)),
+        deviation=max([found.deviation, *(plan.deviation for plan in plans)]),
     )  # fmt: skip
 
 
 def _step(plan: StepPlan, start: float, end: float, left: float) -> TaskStep:
     """Return the record of a step that was planned."""
     step, world, after = plan.step, plan.world, plan.after
-    released = grasped = ()
+    released, grasped = tuple[str, ...](), tuple[str, ...]()
     if isinstance(step, ReleaseStep):
         released = step.objects or world.held_by(step.hand)
     elif isinstance(step, GraspStep):
         grasped = (step.object,)
+    leaving = world.leaving_pairs(step.hand) if isinstance(step, RetreatStep) else ()
     gone = tuple(name for name in released if name not in after.scene and name not in after.held)
     return TaskStep(
         step.kind, step.title, start, end, plan.path, plan.clearance, tuple(world.scene.values()),
-        tuple(world.held.values()), tuple(sorted(world.pairs)), left, released, grasped, gone,
+        tuple(world.held.values()), tuple(sorted(world.pairs)), left, tuple(sorted(leaving)), released, grasped, gone,
     )  # fmt: skip

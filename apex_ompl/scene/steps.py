@@ -1,14 +1,22 @@
-"""Steps after the goal of a problem: what problem files write as ``after``, but for ``move``, which has a goal of its own.
+"""Steps after the goal of a problem: what problem files write as ``after``.
 
 Each starts at rest in the last state of the one before it, and ends at rest. A frame is named after a hand, a link or
-a held object, see :func:`apex_ompl.constraints.frames.frame_of`. Lengths are in meters, the world has z up.
+a held object, see :func:`apex_ompl.constraints.frames.frame_of`. Lengths are in meters, the world has z up. Motions to
+further goals are defined beside these, in :mod:`apex_ompl.scene.problem`.
 """
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from apex_ompl.scene.bodies import Coordinate, Direction, Name, Size
 from apex_ompl.util.schema import StrictModel
@@ -179,7 +187,7 @@ class ReleaseStep(Step):
 
 
 class GraspStep(Step):
-    """A hand closes on an obstacle, or on an object that another hand holds, and holds it from then on.
+    """A hand closes on an obstacle, or on an object that another hand holds, and holds it.
 
     Attributes:
         hand: Name of the hand.
@@ -234,4 +242,3 @@ class WaitStep(Step):
     def subject(self) -> str:
         """The time."""
         return f"{self.seconds:g} s"
-
