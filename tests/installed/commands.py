@@ -49,7 +49,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         "plan ball_in_cup --timeout 20 --objective calm --calm-factor 1.3 --max-tool-speed 1.0 --payload left_hand=0.5 "
         "--torque-scale 0.9 --max-torque left_joint1=80",
     ),
-    ((0,), "plan ball_in_cup --timeout 20 --objective length --no-torque-limits"),
+    ((0,), "plan ball_in_cup --timeout 20 --objective length --no-torque-limits --to-goal"),
     (
         (0, 1),
         "run popup/vertical/large/12 --method no-network --clock sim --prediction cv --speed 0.9 --budget 0.05 "

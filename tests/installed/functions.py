@@ -30,6 +30,7 @@ def run(root: Path) -> list[str]:
     made: set[type] = set()
     with _traced(called, made):
         _use_planner()
+        _use_tasks()
         _use_records()
         _use_trajectories()
         _use_problems()
@@ -137,6 +138,20 @@ def _use_planner() -> None:
         planner.plan(home, home, timeout=-1.0)
     except apex_ompl.ApexError as error:
         assert "timeout" in str(error)
+
+
+def _use_tasks() -> None:
+    """Tasks: the steps after a goal."""
+    import apex_ompl
+
+    robot = apex_ompl.load_robot("dual_panda_softhand")
+    task = apex_ompl.plan_task("stack_boxes", timeout=20.0)
+    assert task and task.steps[-1].kind == "retreat" and task.step_at(0.0).kind == "goal"
+    assert task.object_poses(robot, task.goal_time)["upper"] is not None
+    task.save("task.npz")
+    assert apex_ompl.TaskResult.load("task.npz").as_dict() == task.as_dict()
+    with apex_ompl.MotionPlanner(robot) as planner:
+        assert planner.plan_task(apex_ompl.load_problem("handover"), timeout=20.0)
 
 
 def _use_records() -> None:
