@@ -6,20 +6,32 @@ import argparse
 import json
 
 from apex_ompl import api
+from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import INTERRUPTED, SUFFIXES, Outcome
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.util.files import check_writable, suffix_of
+from apex_ompl.util.validation import check_name
+
+DRIVERS = ("kinematic", "mujoco")
+"""What follows motions: an exact robot in closed loop, or one in physics."""
 
 
 def run(parsed: argparse.Namespace) -> int:
-    """Run the loop, write the run, print it, and return the exit code."""
+    """Run the loop, or a task in physics, write the run, print it, and return the exit code."""
+    check_name(parsed.driver, "driver", DRIVERS)
+    if parsed.driver == "mujoco":
+        from apex_ompl.cli.physics import execute
+
+        return execute(parsed)
+    if parsed.film is not None:
+        raise ParameterError("--film", str(parsed.film), "--driver mujoco beside it; for the loop see apex-ompl render")
     if parsed.out is not None:
         suffix_of(parsed.out, SUFFIXES)
         check_writable(parsed.out)
     latency = -1.0 if parsed.latency is None else parsed.latency
     settings = LoopSettings(budget=parsed.budget, latency=latency, timeout=parsed.timeout, evade=parsed.evade)
     result = api.run(
-        parsed.world, parsed.method, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed,
+        parsed.world, parsed.method, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed or 0,
         speed=parsed.speed, settings=settings,
     )  # fmt: skip
     if parsed.out is not None:

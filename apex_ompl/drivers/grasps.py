@@ -2,12 +2,13 @@
 
 The synergy of a hand is commanded beyond the first contact with an object; its fingers are springs that yield, and the
 torque of the synergy is limited. While a hand closes, a soft weld without weight guides the object. An object
-that two links of a hand press on may then be welded to its palm.
+that two links of a hand press on may then be welded to its palm. An object that two hands hold at once, as the ends of
+a tray, is welded to both palms, whether they touch it or not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +27,7 @@ SQUEEZE = 0.8  # of the synergy, beyond first contact
 CLOSING, OPENING = 0.8, 0.4  # in which a hand closes on an object, and lets it go [s]
 GUIDE = ((0.02, 1.0), (0.9, 0.95))  # solref and first two of solimp of the weld that guides an object
 LEAST_FORCE, LEAST_LINKS = 0.3, 2  # of links that press on an object [N], and their number, for a weld
-FRICTION, WELD, LOOSE = "friction", "weld", "lost"
+FRICTION, WELD, LOST = "friction", "weld", "lost"
 
 
 @dataclass(frozen=True)
@@ -71,12 +72,12 @@ class Grasps:
     def close(self) -> None:
         """Close the hands on what they hold at the start, while it is guided, and let friction hold what it can."""
         driver = self.driver
-        held = [(one, hand) for one in self._objects.values() if one.touch_links != () for hand in holders(driver, one)]
+        held = [(one, hand) for one in self._objects.values() if one.touch_links != () for hand in hands_of(driver.robot, one)]
         with _Guide(driver, [one for one in self._objects.values() if driver.twin.welded_to(one)]):
             self._press({hand for _, hand in held})
             driver.advance(driver.time + CLOSING)
         for one, hand in held:
-            self._hold(one.name, hand, first=True)
+            self._hold(one.name, hand)
 
     def grasp(self, name: str, hand: str, advance: Callable[[float], None] | None = None) -> None:
         """Close a hand on an object that another one holds, or that stands somewhere, and hold it.
@@ -102,14 +103,14 @@ class Grasps:
         for name in names:
             self.driver.twin.weld(self.driver.data, name, self._palm(hand), active=False)
 
-    def _hold(self, name: str, hand: str, first: bool = False) -> None:
+    def _hold(self, name: str, hand: str) -> None:
         twin, data = self.driver.twin, self.driver.data
         links = twin.robot.hand_of(self._palm(hand))
         forces = {k: float(np.linalg.norm(f)) for k, f in twin.forces(data, name).items() if k in links}
         pressing = tuple(sorted(link for link, force in forces.items() if force > LEAST_FORCE))
         kind = FRICTION if name in self.friction else WELD
-        if len(pressing) < LEAST_LINKS:
-            kind = LOOSE
+        if len(pressing) < LEAST_LINKS and self._objects[name].links is None:
+            kind = LOST
         twin.weld(data, name, self._palm(hand), active=kind == WELD)
         self.found.append(GraspFound(name, hand, kind, pressing, sum(forces[link] for link in pressing)))
 
@@ -149,11 +150,6 @@ class _Guide:
         self.driver.data.eq_active[self.welds] = False
 
 
-def holders(driver: MujocoDriver, held: AttachedObject) -> tuple[str, ...]:
-    """Return the names of the hands that hold an object."""
-    return hands_of(driver.robot, held)
-
-
 def hands_of(robot: Robot, held: AttachedObject) -> tuple[str, ...]:
     """Return the names of the hands that hold an object."""
     return tuple(name for name, hand in robot.hands.items() if set(held.holders) & set(robot.hand_of(hand.palm)))
@@ -168,11 +164,3 @@ def turned(first: Array, second: Array) -> float:
     """Return the angle between the orientations of two poses, shape (4, 4) [rad]."""
     cosine = (np.trace(first[:3, :3].T @ second[:3, :3]) - 1.0) / 2.0
     return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def apart(first: Mapping[str, Array], second: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
-    """Return distances [m] and angles [rad] between poses by name."""
-    return {
-        name: (float(np.linalg.norm(first[name][:3, 3] - second[name][:3, 3])), turned(first[name], second[name]))
-        for name in first
-    }

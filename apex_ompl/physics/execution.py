@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.drivers.grasps import GRASPING, LOOSE, Grasps, hands_of, in_link, turned
+from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, in_link, turned
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.twin import TwinSettings
 from apex_ompl.physics.judges import Check, Intended, Judge
@@ -47,9 +47,7 @@ def rehearsed(robot: Robot, trial: Trial, motion: Trajectory, settings: TwinSett
     driver = MujocoDriver(robot, real, settings=replace(settings, friction=HARD[0] * settings.friction))
     grasps = Grasps(driver)
     single = {one.name: one.link for one in heavy if len(hands_of(robot, one)) == 1 and one.touch_links != ()}
-    for one in heavy:
-        if one.name not in single and one.touch_links != ():
-            grasps.friction.discard(one.name)
+    grasps.friction &= single.keys()
     first = {name: in_link(driver, name, link) for name, link in single.items()}
     grasps.close()
     slips = dict.fromkeys(single, (0.0, 0.0))
@@ -108,7 +106,7 @@ class Executor:
         self._wait(SETTLING)
         standing = self._standing()
         driver.forget()
-        lost = [one for one in self.grasps.found if one.kind == LOOSE and not self._carried(one.object)]
+        lost = [one for one in self.grasps.found if one.kind == LOST]
         after: list[Step | None] = [None, *self.plan.problem.after]
         for planned, step in zip(self.plan.steps, after, strict=True):
             self._follow(planned, step, part_of(motion, planned.start, planned.end))
@@ -116,11 +114,6 @@ class Executor:
         judge = Judge(self.trial.known, driver, intended(self.robot, self.plan), standing)
         checks = judge.checks()
         return self._result(checks, [f"{one.hand} did not get hold of {one.object}" for one in lost])
-
-    def _carried(self, name: str) -> bool:
-        """Whether both hands hold an object, or it stands on another one."""
-        held = {one.name: one for one in self.trial.known.attached}
-        return held[name].touch_links == () or held[name].links is not None
 
     def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:
         driver, begin = self.driver, self.driver.time
