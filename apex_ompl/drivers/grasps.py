@@ -73,7 +73,7 @@ class Grasps:
         """Close the hands on what they hold at the start, while it is guided, and let friction hold what it can."""
         driver = self.driver
         held = [(one, hand) for one in self._objects.values() if one.touch_links != () for hand in hands_of(driver.robot, one)]
-        with _Guide(driver, [one for one in self._objects.values() if driver.twin.welded_to(one)]):
+        with _Guide(driver, [one for one in self._objects.values() if driver.twin.welded_to(one)], self.friction):
             self._press({hand for _, hand in held})
             driver.advance(driver.time + CLOSING)
         for one, hand in held:
@@ -126,10 +126,12 @@ class Grasps:
 
 
 class _Guide:
-    """Soft welds of objects without weight, while hands close on them."""
+    """Welds of objects without weight, while hands close on them; soft ones of those that friction is to hold."""
 
-    def __init__(self, driver: MujocoDriver, objects: Collection[AttachedObject]) -> None:
-        self.driver, self.objects = driver, objects
+    def __init__(
+        self, driver: MujocoDriver, objects: Collection[AttachedObject], yielding: Collection[str]
+    ) -> None:  # fmt: skip
+        self.driver, self.objects, self.yielding = driver, objects, yielding
         model = driver.twin.model
         self.welds = [model.equality(f"{one.name} {one.link}").id for one in objects]
         self.bodies = [model.body(one.name).id for one in objects]
@@ -139,8 +141,9 @@ class _Guide:
         self._stiff: tuple[Any, Any] = model.eq_solref[self.welds].copy(), model.eq_solimp[self.welds].copy()
         for one in self.objects:
             twin.weld(self.driver.data, one.name, one.link)
-        for weld in self.welds:
-            model.eq_solref[weld], model.eq_solimp[weld, :2] = GUIDE
+        for one, weld in zip(self.objects, self.welds, strict=True):
+            if one.name in self.yielding:
+                model.eq_solref[weld], model.eq_solimp[weld, :2] = GUIDE
         model.body_gravcomp[self.bodies] = 1.0
 
     def __exit__(self, *_: object) -> None:

@@ -19,6 +19,7 @@ from apex_ompl.physics.trials import Spread, Trial, draw
 from apex_ompl.planning.planner import MotionPlanner
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.robot import load_robot
+from apex_ompl.scene.constraints import Upright
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
 from apex_ompl.timing.trajectory import Trajectory
@@ -27,6 +28,7 @@ from apex_ompl.types import Array
 GRAVITY = 9.81  # [m/s^2]
 TIMEOUT = 30.0  # of planning [s]
 STEEPEST = 0.3  # ratio of level acceleration to gravity of what stands on a tray, and of liquids
+SPILLING = 1.3  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
 SLOWER, ROUNDS = 0.85, 5  # factor of the speed where a plan is too fast, and number of plans
 SAMPLES = 400  # of a motion
 
@@ -101,7 +103,9 @@ class TaskRunner:
         for _ in range(ROUNDS):
             s = self._scale
             timing = Timing(velocity_scale=s, acceleration_scale=s * s, jerk_scale=s**3)
-            plan = self._planner.plan_task(known, timeout=self.timeout, seed=seed, timing=timing)
+            plan = self._planner.plan_task(
+                known, timeout=self.timeout, seed=seed, timing=timing, constraints=self._level(known)
+            )  # fmt: skip
             if not plan or plan.trajectory is None or not loose:
                 break
             factor = max((self._slower(known, name, plan.trajectory) for name in loose), default=1.0)
@@ -109,6 +113,16 @@ class TaskRunner:
                 break
             self._scale = max(SLOWER * factor * s, 0.02)
         return plan
+
+    def _level(self, problem: Problem) -> tuple[Upright, ...]:
+        """Return constraints by which full vessels do not tilt too far on the way to the goal."""
+        upright = {one.frame for one in problem.constraints if isinstance(one, Upright)}
+        held = {one.name: one.contact for one in problem.attached}
+        return tuple(
+            Upright(frame=name, axis=held[name].axis, angle=SPILLING)
+            for name in filled(problem)
+            if name not in upright
+        )
 
     def _slower(self, problem: Problem, name: str, motion: Trajectory) -> float:
         """Return the factor of the speed of a motion at which an object's level acceleration is small enough."""
