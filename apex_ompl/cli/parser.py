@@ -112,6 +112,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_plan(commands)  # in the order of the help text
     _add_run(commands)
+    _add_ros2(commands)
     _add_pictures(commands)
     _add_view(commands)
     _add_convert(commands)
@@ -235,6 +236,19 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the run: .npz or .json")
     parser.add_argument("--json", action="store_true", help="print the outcome and the metrics as JSON")
     parser.set_defaults(run="run:run")
+
+
+def _add_ros2(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("ros2", help="a node of ROS 2 that moves a robot to goals, beside its controllers")
+    parser.add_argument(
+        "source", nargs="?", default="dual_panda_softhand", metavar="ROBOT or PROBLEM",
+        help="a robot or its file, or a problem with obstacles and held objects (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...",
+        help="all that follows is for ROS: -p NAME:=VALUE, --params-file FILE, -r NAME:=OTHER, ...",
+    )  # fmt: skip
+    parser.set_defaults(run="ros2:run")
 
 
 def _add_pictures(commands: Commands[argparse.ArgumentParser]) -> None:

@@ -294,9 +294,9 @@ def _use_run() -> None:
 
 
 def _use_drivers() -> None:
-    """An exact robot, and one that writes a bag; docs/drivers.md uses that of physics."""
+    """Exact robots, one that writes a bag, and one by functions; docs/drivers.md uses that of physics."""
     import apex_ompl
-    from apex_ompl.drivers import BagDriver, KinematicDriver
+    from apex_ompl.drivers import BagDriver, CombinedDriver, FrankaSettings, FunctionDriver, Guard, KinematicDriver
 
     robot = apex_ompl.load_robot("panda")
     goal = robot.home + 0.2 * (np.arange(robot.dof) == 0)
@@ -309,3 +309,13 @@ def _use_drivers() -> None:
         assert not driver.state().velocities.any()
         driver.close()
     assert Path("bag/metadata.yaml").exists()
+    pushed = KinematicDriver(robot, guard=Guard(tracking=0.02), joints=robot.joint_names[:4])
+    pushed.push(np.full(4, 0.03))
+    assert pushed.fault and np.abs(pushed.recover() - robot.home[:4] - 0.03).max() < 1e-9
+    rest = FunctionDriver(robot, robot.joint_names[4:], lambda q: None, rate=500.0)
+    whole = CombinedDriver(robot, [rest, KinematicDriver(robot, clock=lambda: rest.time, joints=robot.joint_names[:4])])
+    whole.send(motion, whole.time + 0.05)
+    whole.stop()
+    assert not whole.fault
+    whole.close()
+    assert FrankaSettings(rate=500.0).lead == 0.02

@@ -2,7 +2,8 @@
 
 From the top, as CONTRIBUTING has it:
 
-1. `cli` parses commands; `evaluation` runs OMPL's Benchmark and reports; `viz` draws: renderings, plots, the viewer.
+1. `cli` parses commands; `evaluation` runs OMPL's Benchmark and reports; `viz` draws: renderings, plots, the viewer;
+   `ros2` is a node of ROS 2.
 2. `api`: `load_problem`, `setup`, `plan`, `run`; `loop`: environment, sensor, executor and clocks; `loop.replan`:
    replanners.
 3. `planning`: `MotionPlanner`, `World`, the steps of a plan; `result`: what a plan returns.
@@ -51,7 +52,7 @@ LAYERS = [
     {"planning"},
     {"loop"},
     {"api"},
-    {"evaluation", "viz"},
+    {"evaluation", "ros2", "viz"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}
