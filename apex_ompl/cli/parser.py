@@ -202,7 +202,9 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser("run", help="go to a goal in closed loop while obstacles move, or execute a task in physics")
+    parser = commands.add_parser(
+        "run", help="go to a goal in closed loop while obstacles move, or execute a task in physics"
+    )
     parser.add_argument("world", help=f"a world such as popup/vertical/large/12, or {PROBLEM_HELP}")
     parser.add_argument(
         "--method", default="apex", help="apex, or a replanner of docs/closed_loop.md such as no-network, "

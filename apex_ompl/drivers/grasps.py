@@ -72,8 +72,9 @@ class Grasps:
     def close(self) -> None:
         """Close the hands on what they hold at the start, while it is guided, and let friction hold what it can."""
         driver = self.driver
-        held = [(one, hand) for one in self._objects.values() if one.touch_links != () for hand in hands_of(driver.robot, one)]
-        with _Guide(driver, [one for one in self._objects.values() if driver.twin.welded_to(one)], self.friction):
+        objects = self._objects.values()
+        held = [(one, hand) for one in objects if one.touch_links != () for hand in hands_of(driver.robot, one)]
+        with _Guide(driver, [one for one in objects if driver.twin.welded_to(one)], self.friction):
             self._press({hand for _, hand in held})
             driver.advance(driver.time + CLOSING)
         for one, hand in held:

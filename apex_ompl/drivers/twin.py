@@ -434,9 +434,7 @@ class Twin:
         added.fullinertia = load.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         self._add_geoms(spec, added, coal_geometry(held), np.eye(4), "held")
         for link in self.welded_to(held):
-            weld = spec.add_equality(
-                name=f"{held.name} {link}", type=mj.mjtEq.mjEQ_WELD, objtype=mj.mjtObj.mjOBJ_BODY
-            )
+            weld = spec.add_equality(name=f"{held.name} {link}", type=mj.mjtEq.mjEQ_WELD, objtype=mj.mjtObj.mjOBJ_BODY)
             weld.name1, weld.name2, weld.active = link, held.name, link == held.link
             weld.data[:11] = [0.0, 0.0, 0.0, *held.position, *_quaternion(held.pose), 1.0]
             weld.solref, weld.solimp = RIGID["solref"], RIGID["solimp"]

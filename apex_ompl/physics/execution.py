@@ -42,7 +42,9 @@ def rehearsed(robot: Robot, trial: Trial, motion: Trajectory, settings: TwinSett
         motion: A motion to its goal.
         settings: Settings of the model.
     """
-    heavy = [held.model_copy(update={"mass": HARD[1] * (held.mass or 1.0), "inertia": None}) for held in trial.known.attached]
+    masses = {held.name: HARD[1] * (held.mass or 1.0) for held in trial.known.attached}
+    changes = {name: {"mass": mass, "inertia": None} for name, mass in masses.items()}
+    heavy = [held.model_copy(update=changes[held.name]) for held in trial.known.attached]
     real = trial.known.model_copy(update={"attached": tuple(heavy)})
     driver = MujocoDriver(robot, real, settings=replace(settings, friction=HARD[0] * settings.friction))
     grasps = Grasps(driver)
@@ -177,9 +179,7 @@ class Executor:
         """Return contacts of links with anything but the objects that the problem holds."""
         objects, links = {one.name for one in self.trial.real.attached}, set(self.robot.link_names)
         return {
-            pair: depth
-            for pair, depth in self.driver.contacts.items()
-            if set(pair) & links and not set(pair) & objects
+            pair: depth for pair, depth in self.driver.contacts.items() if set(pair) & links and not set(pair) & objects
         }
 
 

@@ -193,7 +193,8 @@ class Judge:
         return {other for pair in pairs for other in pair if other != name}
 
     def _on_floor(self, name: str) -> bool:
-        return bool(self.driver.pose(name)[2, 3] < self.driver.twin.settings.floor + 0.5) or "world" in self._touched(name)
+        low = self.driver.twin.settings.floor + 0.5
+        return bool(self.driver.pose(name)[2, 3] < low) or "world" in self._touched(name)
 
     def _speed(self, name: str) -> float:
         at = self.driver.twin.model.joint(name).dofadr[0]

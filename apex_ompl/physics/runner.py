@@ -117,12 +117,9 @@ class TaskRunner:
     def _level(self, problem: Problem) -> tuple[Upright, ...]:
         """Return constraints by which full vessels do not tilt too far on the way to the goal."""
         upright = {one.frame for one in problem.constraints if isinstance(one, Upright)}
-        held = {one.name: one.contact for one in problem.attached}
-        return tuple(
-            Upright(frame=name, axis=held[name].axis, angle=SPILLING)
-            for name in filled(problem)
-            if name not in upright
-        )
+        axes = {one.name: one.contact.axis for one in problem.attached if one.contact is not None}
+        full = [name for name in filled(problem) if name not in upright]
+        return tuple(Upright(frame=name, axis=axes[name], angle=SPILLING) for name in full)
 
     def _slower(self, problem: Problem, name: str, motion: Trajectory) -> float:
         """Return the factor of the speed of a motion at which an object's level acceleration is small enough."""
