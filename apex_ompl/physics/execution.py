@@ -113,7 +113,10 @@ class Executor:
         for planned, step in zip(self.plan.steps, after, strict=True):
             self._follow(planned, step, part_of(motion, planned.start, planned.end))
         self._wait(RESTING)
-        judge = Judge(self.trial.known, driver, intended(self.robot, self.plan), standing)
+        still = {body.name for body in (*self.trial.known.scene, *self.robot.fixtures)}
+        touched = [pair for pair in self._touched() if still & set(pair)]
+        end = self.plan.steps[-1].path.states[-1]
+        judge = Judge(self.trial.known, driver, intended(self.robot, self.plan), end, standing, touched)
         checks = judge.checks()
         return self._result(checks, [f"{one.hand} did not get hold of {one.object}" for one in lost])
 

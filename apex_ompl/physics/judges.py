@@ -5,15 +5,16 @@ The checks are derived from the problem and from where its plan has the objects 
 - an object that a hand is to hold is in it,
 - an object that was released is at rest where it was to be; one that was to fall is inside the object that it was
   aligned with, or on an obstacle below,
-- an object that is aligned with another one and still held is aligned,
+- an object that is aligned with another one, or was brought onto its face, and is still held is so,
 - what stands on a tray stands on it,
 - a liquid is in the vessels that were to stay upright, or for the most part in the one that it was poured into,
-- nothing is on the floor.
+- nothing is on the floor,
+- hands are where the plan ends, and no link touched an obstacle or a fixture.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,7 +24,8 @@ from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.vessels import Vessel, filled, vessels
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject
-from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Problem
+from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Problem, Tolerance
+from apex_ompl.scene.steps import LineStep
 from apex_ompl.types import Array
 
 HELD, HELD_ANGLE = 0.02, 0.35  # most distance and angle of held objects from where the problem has them [m, rad]
@@ -32,6 +34,8 @@ STANDING, STANDING_ANGLE = 0.03, 0.2  # of what stands on a tray from where it s
 FALLEN = 0.15  # level distance between where an object was released and where it fell [m]
 ALIGNED, ALIGNED_ANGLE = 0.015, 0.2  # of faces beyond the tolerance of the alignment
 SPEED = 0.02  # of objects at rest [m/s]
+EXACT = Tolerance(lateral=1e-3, axial=1e-3, angle=1e-3)  # of faces that a line brings together
+REACHED = 0.01  # of palms from where the plan ends [m]
 STAYED, POURED = 1.0, 0.75  # least shares of a liquid
 
 
@@ -75,13 +79,17 @@ class Judge:
         problem: The problem, without liquids.
         driver: The robot, at the end.
         intended: Where the objects were to be.
+        end: State in which the plan ends, shape (dof,) [rad].
         standing: Object that stands on another one -> that one, and its pose in the frame of it at the start.
+        touched: Pairs of a link and an obstacle that touched.
     """
 
     problem: Problem
     driver: MujocoDriver
     intended: Mapping[str, Intended]
+    end: Array
     standing: Mapping[str, tuple[str, Array]] = field(default_factory=dict)
+    touched: Collection[tuple[str, str]] = ()
 
     def checks(self) -> tuple[Check, ...]:
         """Return all checks."""
@@ -99,8 +107,18 @@ class Judge:
                 yield self._placed(one)
         yield from self._aligned()
         yield from self._liquids()
+        yield from self._reached()
         low = [held.name for held in self.driver.twin.held if self._on_floor(held.name)]
         yield Check("nothing is on the floor", not low, f"{', '.join(low)} on the floor" if low else "nothing")
+        pairs = "; ".join(f"{a} and {b}" for a, b in sorted(self.touched))
+        yield Check("no link touches an obstacle", not pairs, pairs or "none")
+
+    def _reached(self) -> Iterator[Check]:
+        robot, driver = self.driver.robot, self.driver
+        for name, hand in robot.hands.items():
+            off = driver.pose(hand.palm)[:3, 3] - robot.link_pose(self.end, hand.palm)[:3, 3]
+            away = float(np.linalg.norm(off))
+            yield Check(f"{name} is where the plan ends", away <= REACHED, f"{1e3 * away:.1f} mm off")
 
     def _held(self, one: Intended) -> Check:
         pose = np.linalg.inv(self.driver.pose(one.link)) @ self.driver.pose(one.name)
@@ -131,30 +149,28 @@ class Judge:
         return _near(f"{name} stands on {carrier}", pose, first, STANDING, STANDING_ANGLE)
 
     def _aligned(self) -> Iterator[Check]:
-        """Yield the check of two faces that are held at the end and were to be aligned."""
-        goal = self.problem.goal.alignment
-        held = {one.name: one for one in self.problem.attached}
-        if goal is None or goal.kind in ("pour", "handover") or self.problem_has_steps:
+        """Yield the check of two faces that are held at the end and were brought together last."""
+        goal, steps = self.problem.goal.alignment, self.problem.after
+        onto = [one for one in steps if isinstance(one, LineStep) and one.onto is not None]
+        if onto and onto[-1] is steps[-1] and onto[-1].distance is not None:
+            yield from self._faces(str(onto[-1].onto), onto[-1].frame[0], onto[-1].distance, EXACT)
+        elif not steps and goal is not None and goal.kind not in ("pour", "handover"):
+            default, tolerance = ALIGNMENT_DEFAULTS[goal.kind]
+            distance = default if goal.distance is None else goal.distance
+            yield from self._faces(str(goal.first), str(goal.second), distance, goal.tolerance or tolerance)
+
+    def _faces(self, first: str, second: str, distance: float, bounds: Tolerance) -> Iterator[Check]:
+        held = {one.name: one for one in self.problem.attached if one.contact is not None}
+        if first not in held or second not in held:
             return
-        pair = [held.get(str(name)) for name in (goal.first, goal.second)]
-        if any(one is None or one.contact is None for one in pair):
-            return
-        (p1, a1), (p2, a2) = (self._face(one) for one in pair if one is not None)
-        default, tolerance = ALIGNMENT_DEFAULTS[goal.kind]
-        bounds = goal.tolerance or tolerance
-        e, distance = p2 - p1, default if goal.distance is None else goal.distance
+        (p1, a1), (p2, a2) = self._face(held[first]), self._face(held[second])
+        e = p2 - p1
         lateral, axial = float(np.linalg.norm(e - (a1 @ e) * a1)), abs(float(a1 @ e) - distance)
         angle = float(np.arccos(np.clip(-a1 @ a2, -1.0, 1.0)))
         passed = lateral <= bounds.lateral + ALIGNED and axial <= bounds.axial + ALIGNED
-        found = f"{1e3 * lateral:.1f} mm across, {1e3 * axial:.1f} mm along, {angle:.3f} rad"
-        yield Check(
-            f"{goal.first} is aligned with {goal.second}", passed and angle <= bounds.angle + ALIGNED_ANGLE, found
-        )
-
-    @property
-    def problem_has_steps(self) -> bool:
-        """Whether there are steps after the goal."""
-        return bool(self.problem.after)
+        found = f"{1e3 * lateral:.1f} mm across, {1e3 * axial:.1f} mm along, {angle:.3f} rad off"
+        what = f"{second} is {1e3 * distance:.0f} mm from the face of {first}"
+        yield Check(what, passed and angle <= bounds.angle + ALIGNED_ANGLE, found)
 
     def _face(self, one: AttachedObject) -> tuple[Array, Array]:
         assert one.contact is not None

@@ -29,7 +29,8 @@ GRAVITY = 9.81  # [m/s^2]
 TIMEOUT = 30.0  # of planning [s]
 STEEPEST = 0.3  # ratio of level acceleration to gravity of what stands on a tray, and of liquids
 SPILLING = 1.3  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
-SLOWER, ROUNDS = 0.85, 5  # factor of the speed where a plan is too fast, and number of plans
+SLOWER, SLOWEST = 0.85, 0.02  # factors of the speed where a plan is too fast, and the least one
+ROUNDS = 5  # plans of a task, each slower
 SAMPLES = 400  # of a motion
 
 
@@ -62,7 +63,7 @@ class TaskRunner:
             raise ParameterError("problem", self.problem.moving[0], "obstacles that stand still")
         self.robot = load_robot(self.problem.robot)
         self._planner = MotionPlanner(self.robot)
-        self._scale = 1.0
+        self._scale: float | None = None  # of the speed, of the plan from the problem's start
 
     def run(self, seed: int | None = None, film: tuple[int, int] | None = None) -> tuple[TaskRun, list[Any]]:
         """Execute the task once.
@@ -77,31 +78,31 @@ class TaskRunner:
         Raises:
             ApexError: The problem is faulty.
         """
-        if self.friction is None:
-            self.friction = self._rehearsed()
+        if self._scale is None:
+            self._rehearse()
         trial = draw(self.robot, self.problem, seed, self.spread, self.settings.density)
-        plan = self._plan(trial, seed or 0)
+        plan, _ = self._plan(trial, seed or 0)
         if not plan or plan.trajectory is None:
             return unplanned(self.problem, seed, plan), []
         executor = Executor(
-            self.robot, trial, plan, friction=self.friction, settings=self.settings, seed=seed, film=film
+            self.robot, trial, plan, friction=self.friction or (), settings=self.settings, seed=seed, film=film
         )  # fmt: skip
         return executor.run(), executor.frames
 
-    def _rehearsed(self) -> frozenset[str]:
+    def _rehearse(self) -> None:
+        """Find the speed of plans from the start of the problem, and what friction holds along its motion."""
         trial = draw(self.robot, self.problem, None, self.spread, self.settings.density)
-        plan = self._plan(trial, 0)
-        if not plan or plan.trajectory is None:
-            return frozenset()
-        motion = part_of(plan.trajectory, plan.steps[0].start, plan.steps[0].end)
-        return rehearsed(self.robot, trial, motion, self.settings)
+        plan, self._scale = self._plan(trial, 0)
+        if self.friction is None and plan and plan.trajectory is not None:
+            motion = part_of(plan.trajectory, plan.steps[0].start, plan.steps[0].end)
+            self.friction = rehearsed(self.robot, trial, motion, self.settings)
 
-    def _plan(self, trial: Trial, seed: int) -> TaskResult:
-        """Plan, more slowly where what stands or flows would fall or spill."""
+    def _plan(self, trial: Trial, seed: int) -> tuple[TaskResult, float]:
+        """Plan, more slowly where what stands or flows would fall or spill, and return the factor of the speed, too."""
+        s = self._scale or 1.0
         known = trial.known
         loose = [held.name for held in known.attached if held.touch_links == () or held.name in filled(known)]
         for _ in range(ROUNDS):
-            s = self._scale
             timing = Timing(velocity_scale=s, acceleration_scale=s * s, jerk_scale=s**3)
             plan = self._planner.plan_task(
                 known, timeout=self.timeout, seed=seed, timing=timing, constraints=self._level(known)
@@ -111,8 +112,8 @@ class TaskRunner:
             factor = max((self._slower(known, name, plan.trajectory) for name in loose), default=1.0)
             if factor >= 1.0:
                 break
-            self._scale = max(SLOWER * factor * s, 0.02)
-        return plan
+            s = max(SLOWER * factor * s, SLOWEST)
+        return plan, s
 
     def _level(self, problem: Problem) -> tuple[Upright, ...]:
         """Return constraints by which full vessels do not tilt too far on the way to the goal."""
