@@ -15,11 +15,14 @@ import numpy as np
 from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, in_link, turned
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.twin import TwinSettings
+from apex_ompl.drivers.vessels import filled
 from apex_ompl.physics.judges import Check, Intended, Judge
 from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun
 from apex_ompl.physics.trials import Trial
 from apex_ompl.planning.task_result import TaskResult, TaskStep
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.steps import GraspStep, ReleaseStep, Step
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
@@ -28,6 +31,9 @@ RATE = 100.0  # of the log [1/s]
 FILM_RATE = 24.0  # frames of a film [1/s]
 SETTLING, RESTING = 0.2, 1.0  # at rest before the first motion, and after the last one [s]
 SLIP, SLIP_ANGLE = 0.005, 0.1  # of objects that friction holds, at most, along a rehearsal [m, rad]
+STEEPEST = 0.3  # ratio of level acceleration to gravity of what stands on a tray, and of liquids, at most
+GRAVITY = 9.81  # [m/s^2]
+SAMPLES = 400  # of a motion
 HARD = 0.8, 1.2  # factors of friction and mass in a rehearsal
 
 Frames = list[Any]
@@ -111,7 +117,7 @@ class Executor:
         lost = [one for one in self.grasps.found if one.kind == LOST]
         after: list[Step | None] = [None, *self.plan.problem.after]
         for planned, step in zip(self.plan.steps, after, strict=True):
-            self._follow(planned, step, part_of(motion, planned.start, planned.end))
+            self._follow(planned, step, motion_of(self.robot, self.trial.known, motion, planned))
         self._wait(RESTING)
         still = {body.name for body in (*self.trial.known.scene, *self.robot.fixtures)}
         touched = [pair for pair in self._touched() if still & set(pair)]
@@ -194,15 +200,36 @@ def _advance(driver: MujocoDriver, until: float, watch: Callable[[], None]) -> N
         watch()
 
 
-def part_of(motion: Trajectory, start: float, end: float) -> Trajectory:
-    """Return the part of a motion between two of its knots [s]."""
-    first, last = (int(np.argmin(np.abs(motion.times - time))) for time in (start, end))
+def motion_of(robot: Robot, problem: Problem, motion: Trajectory, step: TaskStep) -> Trajectory:
+    """Return the part of a motion that is a step, slowed down where what stands or flows would fall or spill.
+
+    Args:
+        robot: The robot.
+        problem: The problem.
+        motion: The motion through all steps.
+        step: The step, at rest at both ends.
+    """
+    first, last = (int(np.argmin(np.abs(motion.times - time))) for time in (step.start, step.end))
     inside = slice(first, last + 1)
-    times = motion.times[inside]
-    return Trajectory(
-        times - times[0], motion.positions[inside], motion.velocities[inside], motion.accelerations[inside],
-        motion.joint_names,
+    times = motion.times[inside] - motion.times[first]
+    part = Trajectory(
+        times, motion.positions[inside], motion.velocities[inside], motion.accelerations[inside], motion.joint_names
     )  # fmt: skip
+    full = filled(problem)
+    loose = [held for held in step.attached if held.touch_links == () or held.name in full]
+    s = min((_gentle(robot, held, part) for held in loose), default=1.0)
+    return Trajectory(times / s, part.positions, s * part.velocities, s * s * part.accelerations, part.joint_names)
+
+
+def _gentle(robot: Robot, held: AttachedObject, motion: Trajectory) -> float:
+    """Return the factor of the speed of a motion at which an object's level acceleration is small enough."""
+    if motion.duration <= 0.0:
+        return 1.0
+    times = np.linspace(0.0, motion.duration, SAMPLES)
+    places = np.array([(robot.link_pose(q, held.link) @ held.pose)[:3, 3] for q in motion(times)])
+    a = np.diff(places, 2, axis=0) / (times[1] - times[0]) ** 2
+    need = np.linalg.norm(a[:, :2], axis=1) - STEEPEST * a[:, 2]
+    return float(min(1.0, np.sqrt(STEEPEST * GRAVITY / max(float(need.max()), 1e-9))))
 
 
 def intended(robot: Robot, plan: TaskResult) -> Mapping[str, Intended]:

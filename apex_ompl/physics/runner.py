@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,7 +12,7 @@ from apex_ompl.drivers.grasps import GRASPING
 from apex_ompl.drivers.twin import TwinSettings
 from apex_ompl.drivers.vessels import filled
 from apex_ompl.errors import ParameterError
-from apex_ompl.physics.execution import Executor, part_of, rehearsed
+from apex_ompl.physics.execution import Executor, motion_of, rehearsed
 from apex_ompl.physics.result import UNPLANNED, TaskRun
 from apex_ompl.physics.trials import Spread, Trial, draw
 from apex_ompl.planning.planner import MotionPlanner
@@ -21,17 +20,9 @@ from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.constraints import Upright
 from apex_ompl.scene.problem import Problem
-from apex_ompl.timing import Timing
-from apex_ompl.timing.trajectory import Trajectory
-from apex_ompl.types import Array
 
-GRAVITY = 9.81  # [m/s^2]
 TIMEOUT = 30.0  # of planning [s]
-STEEPEST = 0.3  # ratio of level acceleration to gravity of what stands on a tray, and of liquids
 SPILLING = 1.3  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
-SLOWER, SLOWEST = 0.85, 0.02  # factors of the speed where a plan is too fast, and the least one
-ROUNDS = 5  # plans of a task, each slower
-SAMPLES = 400  # of a motion
 
 
 @dataclass(eq=False)
@@ -63,7 +54,6 @@ class TaskRunner:
             raise ParameterError("problem", self.problem.moving[0], "obstacles that stand still")
         self.robot = load_robot(self.problem.robot)
         self._planner = MotionPlanner(self.robot)
-        self._scale: float | None = None  # of the speed, of the plan from the problem's start
 
     def run(self, seed: int | None = None, film: tuple[int, int] | None = None) -> tuple[TaskRun, list[Any]]:
         """Execute the task once.
@@ -78,42 +68,32 @@ class TaskRunner:
         Raises:
             ApexError: The problem is faulty.
         """
-        if self._scale is None:
-            self._rehearse()
+        if self.friction is None:
+            self.friction = self._rehearsed()
         trial = draw(self.robot, self.problem, seed, self.spread, self.settings.density)
-        plan, _ = self._plan(trial, seed or 0)
+        plan = self._plan(trial, seed or 0)
         if not plan or plan.trajectory is None:
             return unplanned(self.problem, seed, plan), []
         executor = Executor(
-            self.robot, trial, plan, friction=self.friction or (), settings=self.settings, seed=seed, film=film
+            self.robot, trial, plan, friction=self.friction, settings=self.settings, seed=seed, film=film
         )  # fmt: skip
         return executor.run(), executor.frames
 
-    def _rehearse(self) -> None:
-        """Find the speed of plans from the start of the problem, and what friction holds along its motion."""
+    def _rehearsed(self) -> frozenset[str]:
+        """Return the names of the objects that friction holds from the start of the problem to the goal."""
         trial = draw(self.robot, self.problem, None, self.spread, self.settings.density)
-        plan, self._scale = self._plan(trial, 0)
-        if self.friction is None and plan and plan.trajectory is not None:
-            motion = part_of(plan.trajectory, plan.steps[0].start, plan.steps[0].end)
-            self.friction = rehearsed(self.robot, trial, motion, self.settings)
+        if not any(held.links is None and held.touch_links != () for held in trial.known.attached):
+            return frozenset()
+        plan = self._plan(trial, 0)
+        if not plan or plan.trajectory is None:
+            return frozenset()
+        return rehearsed(
+            self.robot, trial, motion_of(self.robot, trial.known, plan.trajectory, plan.steps[0]), self.settings
+        )
 
-    def _plan(self, trial: Trial, seed: int) -> tuple[TaskResult, float]:
-        """Plan, more slowly where what stands or flows would fall or spill, and return the factor of the speed, too."""
-        s = self._scale or 1.0
+    def _plan(self, trial: Trial, seed: int) -> TaskResult:
         known = trial.known
-        loose = [held.name for held in known.attached if held.touch_links == () or held.name in filled(known)]
-        for _ in range(ROUNDS):
-            timing = Timing(velocity_scale=s, acceleration_scale=s * s, jerk_scale=s**3)
-            plan = self._planner.plan_task(
-                known, timeout=self.timeout, seed=seed, timing=timing, constraints=self._level(known)
-            )  # fmt: skip
-            if not plan or plan.trajectory is None or not loose:
-                break
-            factor = max((self._slower(known, name, plan.trajectory) for name in loose), default=1.0)
-            if factor >= 1.0:
-                break
-            s = max(SLOWER * factor * s, SLOWEST)
-        return plan, s
+        return self._planner.plan_task(known, timeout=self.timeout, seed=seed, constraints=self._level(known))
 
     def _level(self, problem: Problem) -> tuple[Upright, ...]:
         """Return constraints by which full vessels do not tilt too far on the way to the goal."""
@@ -121,17 +101,6 @@ class TaskRunner:
         axes = {one.name: one.contact.axis for one in problem.attached if one.contact is not None}
         full = [name for name in filled(problem) if name not in upright]
         return tuple(Upright(frame=name, axis=axes[name], angle=SPILLING) for name in full)
-
-    def _slower(self, problem: Problem, name: str, motion: Trajectory) -> float:
-        """Return the factor of the speed of a motion at which an object's level acceleration is small enough."""
-        held = next(one for one in problem.attached if one.name == name)
-        times = np.linspace(0.0, motion.duration, SAMPLES)
-        step = times[1] - times[0]
-        places = np.array([(self.robot.link_pose(q, held.link) @ held.pose)[:3, 3] for q in motion(times)])
-        a = np.diff(places, 2, axis=0) / step**2
-        need: Array = np.linalg.norm(a[:, :2], axis=1) - STEEPEST * a[:, 2]
-        worst = float(need.max(initial=0.0)) / (STEEPEST * GRAVITY)
-        return 1.0 if worst <= 1.0 else 1.0 / math.sqrt(worst)
 
 
 def unplanned(problem: Problem, seed: int | None, plan: TaskResult) -> TaskRun:
