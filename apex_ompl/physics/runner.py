@@ -87,9 +87,8 @@ class TaskRunner:
         plan = self._plan(trial, 0)
         if not plan or plan.trajectory is None:
             return frozenset()
-        return rehearsed(
-            self.robot, trial, motion_of(self.robot, trial.known, plan.trajectory, plan.steps[0]), self.settings
-        )
+        motion = motion_of(self.robot, trial.known, plan.trajectory, plan.steps[0])
+        return rehearsed(self.robot, trial, motion, self.settings)
 
     def _plan(self, trial: Trial, seed: int) -> TaskResult:
         known = trial.known
