@@ -9,7 +9,7 @@ The checks are derived from the problem and from where its plan has the objects 
 - what stands on a tray stands on it,
 - a liquid is in the vessels that were to stay upright, or for the most part in the one that it was poured into,
 - nothing is on the floor,
-- hands are where the plan ends, and no link touched an obstacle or a fixture.
+- hands are where the plan ends, and where none holds an object, no link touched an obstacle or a fixture.
 """
 
 from __future__ import annotations
@@ -110,8 +110,9 @@ class Judge:
         yield from self._reached()
         low = [held.name for held in self.driver.twin.held if self._on_floor(held.name)]
         yield Check("nothing is on the floor", not low, f"{', '.join(low)} on the floor" if low else "nothing")
-        pairs = "; ".join(f"{a} and {b}" for a, b in sorted(self.touched))
-        yield Check("no link touches an obstacle", not pairs, pairs or "none")
+        if not self.problem.attached:
+            pairs = "; ".join(f"{a} and {b}" for a, b in sorted(self.touched))
+            yield Check("no link touched an obstacle", not pairs, pairs or "none")
 
     def _reached(self) -> Iterator[Check]:
         robot, driver = self.driver.robot, self.driver

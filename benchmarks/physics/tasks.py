@@ -42,7 +42,7 @@ def row_of(run: TaskRun, seconds: float) -> dict[str, Any]:
     return {
         "seed": run.seed, "outcome": run.outcome, "reason": run.reason, "failed": failed,
         "causes": causes(run), "grasps": [[one.object, one.hand, one.kind] for one in run.grasps],
-        "metrics": dict(run.metrics), "cpu": round(seconds, 3),
+        "metrics": dict(run.metrics), "contacts": sorted(map(list, run.contacts)), "cpu": round(seconds, 3),
     }  # fmt: skip
 
 
