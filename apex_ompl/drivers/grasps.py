@@ -25,6 +25,7 @@ GRASPING = TwinSettings(finger_stiffness=FINGER_STIFFNESS)
 """Settings of twins whose hands grasp."""
 SQUEEZE = 0.8  # of the synergy, beyond first contact
 CLOSING, OPENING = 0.8, 0.4  # in which a hand closes on an object, and lets it go [s]
+SOFT, SOFTENING = ((0.1, 1.0), (0.5, 0.9)), 0.2  # of a weld before it is cut, and for how long [s]
 GUIDE = ((0.02, 1.0), (0.9, 0.95))  # solref and first two of solimp of the weld that guides an object
 LEAST_FORCE, LEAST_LINKS = 0.3, 2  # of links that press on an object [N], and their number, for a weld
 FRICTION, WELD, LOST = "friction", "weld", "lost"
@@ -99,10 +100,20 @@ class Grasps:
     def release(
         self, names: Collection[str], hand: str, advance: Callable[[float], None] | None = None
     ) -> None:  # fmt: skip
-        """Let objects go from a hand that has opened; ``advance`` is as of :meth:`grasp`."""
-        (advance or self.driver.advance)(self.driver.time + OPENING)
-        for name in names:
-            self.driver.twin.weld(self.driver.data, name, self._palm(hand), active=False)
+        """Let objects go from a hand that has opened; ``advance`` is as of :meth:`grasp`.
+
+        Welds yield before they are cut, so that an object that touches something is not thrown off.
+        """
+        driver, model, palm = self.driver, self.driver.twin.model, self._palm(hand)
+        (advance or driver.advance)(driver.time + OPENING)
+        welds = [model.equality(f"{name} {palm}").id for name in names if self._objects[name].touch_links != ()]
+        stiff = model.eq_solref[welds].copy(), model.eq_solimp[welds].copy()
+        for weld in welds:
+            model.eq_solref[weld], model.eq_solimp[weld, :2] = SOFT
+        (advance or driver.advance)(driver.time + SOFTENING)
+        for weld in welds:
+            driver.data.eq_active[weld] = False
+        model.eq_solref[welds], model.eq_solimp[welds] = stiff
 
     def _hold(self, name: str, hand: str) -> None:
         twin, data = self.driver.twin, self.driver.data

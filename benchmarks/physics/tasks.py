@@ -24,6 +24,7 @@ from apex_ompl import problems
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.physics import Spread, TaskRunner
 from apex_ompl.physics.result import UNPLANNED, TaskRun
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.statistics import share_interval
@@ -32,8 +33,19 @@ from benchmarks.lib.pack import RUNS
 
 DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/drivers", "apex_ompl/physics")
 FOLDER = RUNS / "tasks"
-TIMEOUT = 30.0
-HEAD = ("problem", "N", "succeeded", "95 % interval", "held by", "duration s p50", "CPU s p50", "failures")
+TIMEOUT = 120.0  # of a plan [s]
+LINKS = frozenset(robot().link_names)
+HEAD = (
+    "problem",
+    "N",
+    "succeeded",
+    "95 % interval",
+    "held by",
+    "duration s p50",
+    "CPU s p50",
+    "links touched obstacles in",
+    "failures",
+)
 
 
 def row_of(run: TaskRun, seconds: float) -> dict[str, Any]:
@@ -42,7 +54,7 @@ def row_of(run: TaskRun, seconds: float) -> dict[str, Any]:
     return {
         "seed": run.seed, "outcome": run.outcome, "reason": run.reason, "failed": failed,
         "causes": causes(run), "grasps": [[one.object, one.hand, one.kind] for one in run.grasps],
-        "metrics": dict(run.metrics), "contacts": sorted(map(list, run.contacts)), "cpu": round(seconds, 3),
+        "metrics": dict(run.metrics), "obstacles": [list(pair) for pair in sorted(run.contacts) if not set(pair) <= LINKS], "cpu": round(seconds, 3),
     }  # fmt: skip
 
 
@@ -79,6 +91,7 @@ def cells(name: str, rows: Sequence[dict[str, Any]]) -> list[Any]:
     return [
         name, len(rows), done, f"{low:.2f} to {high:.2f}", ", ".join(held),
         f"{record.percentiles(durations, 50)[0]:.1f}", f"{np.median([row['cpu'] for row in rows]):.1f}",
+        sum(bool(row["obstacles"]) for row in rows),
         "; ".join(f"{number} {cause}" for cause, number in counted.most_common()),
     ]  # fmt: skip
 
