@@ -25,6 +25,7 @@ GRASPING = TwinSettings(finger_stiffness=FINGER_STIFFNESS)
 """Settings of twins whose hands grasp."""
 SQUEEZE = 0.8  # of the synergy, beyond first contact
 CLOSING, OPENING = 0.8, 0.4  # in which a hand closes on an object, and lets it go [s]
+YIELDING = ((0.004, 1.0), (0.97, 0.99))  # of the weld of an object in one hand, which yields as fingers do
 SOFT, SOFTENING = ((0.1, 1.0), (0.5, 0.9)), 0.2  # of a weld before it is cut, and for how long [s]
 GUIDE = ((0.02, 1.0), (0.9, 0.95))  # solref and first two of solimp of the weld that guides an object
 LEAST_FORCE, LEAST_LINKS = 0.3, 2  # of links that press on an object [N], and their number, for a weld
@@ -124,6 +125,9 @@ class Grasps:
         if len(pressing) < LEAST_LINKS and self._objects[name].links is None:
             kind = LOST
         twin.weld(data, name, self._palm(hand), active=kind == WELD)
+        if self._objects[name].links is None:
+            weld = twin.model.equality(f"{name} {self._palm(hand)}").id
+            twin.model.eq_solref[weld], twin.model.eq_solimp[weld, :2] = YIELDING
         self.found.append(GraspFound(name, hand, kind, pressing, sum(forces[link] for link in pressing)))
 
     def _press(self, hands: Collection[str]) -> None:

@@ -107,7 +107,7 @@ class Executor:
         self._steps: list[tuple[str, float, float]] = []
 
     def run(self) -> TaskRun:
-        """Execute all steps, and judge."""
+        """Execute all steps, up to one in which the driver's guard stops the robot, and judge."""
         driver, motion = self.driver, self.plan.trajectory
         assert motion is not None
         self.grasps.close()
@@ -117,13 +117,15 @@ class Executor:
         lost = [one for one in self.grasps.found if one.kind == LOST]
         after: list[Step | None] = [None, *self.plan.problem.after]
         for planned, step in zip(self.plan.steps, after, strict=True):
+            if driver.fault:
+                break
             self._follow(planned, step, motion_of(self.robot, self.trial.known, motion, planned))
         self._wait(RESTING)
         still = {body.name for body in (*self.trial.known.scene, *self.robot.fixtures)}
         touched = [pair for pair in self._touched() if still & set(pair)]
         end = self.plan.steps[-1].path.states[-1]
         judge = Judge(self.trial.known, driver, intended(self.robot, self.plan), end, standing, touched)
-        checks = judge.checks()
+        checks = (*judge.checks(), Check("the robot follows its motion", not driver.fault, driver.fault or "it does"))
         return self._result(checks, [f"{one.hand} did not get hold of {one.object}" for one in lost])
 
     def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:

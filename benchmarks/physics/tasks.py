@@ -36,25 +36,19 @@ FOLDER = RUNS / "tasks"
 TIMEOUT = 120.0  # of a plan [s]
 LINKS = frozenset(robot().link_names)
 HEAD = (
-    "problem",
-    "N",
-    "succeeded",
-    "95 % interval",
-    "held by",
-    "duration s p50",
-    "CPU s p50",
-    "links touched obstacles in",
+    "problem", "N", "succeeded", "95 % interval", "held by", "duration s p50", "CPU s p50", "links touched obstacles",
     "failures",
-)
+)  # fmt: skip
 
 
 def row_of(run: TaskRun, seconds: float) -> dict[str, Any]:
     """Return what is stored of a run."""
     failed = [f"{check.name}: {check.found}" for check in run.checks if not check.passed]
+    obstacles = [list(pair) for pair in sorted(run.contacts) if not set(pair) <= LINKS]
     return {
-        "seed": run.seed, "outcome": run.outcome, "reason": run.reason, "failed": failed,
-        "causes": causes(run), "grasps": [[one.object, one.hand, one.kind] for one in run.grasps],
-        "metrics": dict(run.metrics), "obstacles": [list(pair) for pair in sorted(run.contacts) if not set(pair) <= LINKS], "cpu": round(seconds, 3),
+        "seed": run.seed, "outcome": run.outcome, "reason": run.reason, "failed": failed, "causes": causes(run),
+        "grasps": [[one.object, one.hand, one.kind] for one in run.grasps], "metrics": dict(run.metrics),
+        "obstacles": obstacles, "cpu": round(seconds, 3),
     }  # fmt: skip
 
 
