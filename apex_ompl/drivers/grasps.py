@@ -1,7 +1,7 @@
 """Hands that hold objects in physics: by friction where that suffices, else by a weld.
 
 The synergy of a hand is commanded beyond the first contact with an object; its fingers are springs that yield, and the
-torque of the synergy is limited. While a hand closes, a soft weld without weight guides the object. An object
+torque of the synergy is limited. An object that a link without a hand holds is welded to it. While a hand closes, a soft weld without weight guides the object. An object
 that two links of a hand press on may then be welded to its palm. An object that two hands hold at once, as the ends of
 a tray, is welded to both palms, whether they touch it or not.
 """
@@ -81,6 +81,9 @@ class Grasps:
             driver.advance(driver.time + CLOSING)
         for one, hand in held:
             self._hold(one.name, hand)
+        for one in objects:
+            if one.touch_links != () and not hands_of(driver.robot, one):
+                driver.twin.weld(driver.data, one.name, one.link)
 
     def grasp(self, name: str, hand: str, advance: Callable[[float], None] | None = None) -> None:
         """Close a hand on an object that another one holds, or that stands somewhere, and hold it.

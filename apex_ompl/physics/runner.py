@@ -20,6 +20,7 @@ from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.constraints import Upright
 from apex_ompl.scene.problem import Problem
+from apex_ompl.util.validation import check_integer, check_name, check_positive
 
 TIMEOUT = 30.0  # of planning [s]
 SPILLING = 1.3  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
@@ -47,11 +48,17 @@ class TaskRunner:
         """Load the robot.
 
         Raises:
-            ParameterError: An obstacle moves.
+            ParameterError: An obstacle moves, fingers do not yield, or the timeout is not positive.
+            UnknownNameError: There is no held object of a name in ``friction``.
             ApexError: The robot is unknown or faulty.
         """
         if self.problem.moving:
             raise ParameterError("problem", self.problem.moving[0], "obstacles that stand still")
+        if self.settings.finger_stiffness is None:
+            raise ParameterError("settings.finger_stiffness", None, "a stiffness: fingers yield to what they grasp")
+        for name in self.friction or ():
+            check_name(name, "held object in friction", [held.name for held in self.problem.attached])
+        check_positive(self.timeout, "timeout")
         self.robot = load_robot(self.problem.robot)
         self._planner = MotionPlanner(self.robot)
 
@@ -67,7 +74,10 @@ class TaskRunner:
 
         Raises:
             ApexError: The problem is faulty.
+            ParameterError: The seed is negative.
         """
+        if seed is not None:
+            check_integer(seed, "seed", 0)
         if self.friction is None:
             self.friction = self._rehearsed()
         trial = draw(self.robot, self.problem, seed, self.spread, self.settings.density)
