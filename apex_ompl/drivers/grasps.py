@@ -1,9 +1,10 @@
 """Hands that hold objects in physics: by friction where that suffices, else by a weld.
 
 The synergy of a hand is commanded beyond the first contact with an object; its fingers are springs that yield, and the
-torque of the synergy is limited. An object that a link without a hand holds is welded to it. While a hand closes, a soft weld without weight guides the object. An object
-that two links of a hand press on may then be welded to its palm. An object that two hands hold at once, as the ends of
-a tray, is welded to both palms, whether they touch it or not.
+torque of the synergy is limited. While a hand closes, a soft weld without weight guides the object. An object that two
+links of a hand press on may then be welded to its palm; the weld yields a little, as fingers do. An object that two
+hands hold at once, as the ends of a tray, is welded to both palms, whether they touch it or not, and one that a link
+without a hand holds to that link.
 """
 
 from __future__ import annotations
