@@ -23,7 +23,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.util.validation import check_integer, check_name, check_positive
 
 TIMEOUT = 30.0  # of planning [s]
-SPILLING = 1.3  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
+SPILLING = 1.45  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
 
 
 @dataclass(eq=False)
