@@ -8,7 +8,7 @@ The checks are derived from the problem and from where its plan has the objects 
 - an object that is aligned with another one, or was brought onto its face, and is still held is so,
 - what stands on a tray stands on it,
 - a liquid is in the vessels that were to stay upright, or for the most part in the one that it was poured into,
-- nothing is on the floor,
+- no object is on the floor, liquids apart,
 - hands are where the plan ends, and where none holds an object, no link touched an obstacle or a fixture.
 """
 
@@ -108,8 +108,8 @@ class Judge:
         yield from self._aligned()
         yield from self._liquids()
         yield from self._reached()
-        low = [held.name for held in self.driver.twin.held if self._on_floor(held.name)]
-        yield Check("nothing is on the floor", not low, f"{', '.join(low)} on the floor" if low else "nothing")
+        low = [held.name for held in self.problem.attached if self._on_floor(held.name)]
+        yield Check("no object is on the floor", not low, f"{', '.join(low)} on the floor" if low else "none")
         if not self.problem.attached:
             pairs = "; ".join(f"{a} and {b}" for a, b in sorted(self.touched))
             yield Check("no link touched an obstacle", not pairs, pairs or "none")

@@ -64,11 +64,11 @@ def test_what_is_held_is_where_the_hand_has_it(robot: Robot) -> None:
     assert scene.put("upper", turned).failed() == {"upper is held by right_hand"}
 
 
-def test_nothing_may_lie_on_the_floor(robot: Robot) -> None:
+def test_no_object_may_lie_on_the_floor(robot: Robot) -> None:
     scene = Scene(robot, cached_problem("stack_boxes"))
     scene.put("upper", shifted(0.5, 0.0, -0.68))
-    assert scene.failed() == {"upper is held by right_hand", "nothing is on the floor"}
-    assert scene.checks()["nothing is on the floor"].found == "upper on the floor"
+    assert scene.failed() == {"upper is held by right_hand", "no object is on the floor"}
+    assert scene.checks()["no object is on the floor"].found == "upper on the floor"
 
 
 def test_what_was_released_is_where_it_was_to_be_and_at_rest(robot: Robot) -> None:
