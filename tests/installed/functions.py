@@ -374,8 +374,25 @@ def _use_perception() -> None:
     frame.save("frame.npz")
     assert np.array_equal(load_frames("frame.npz")[0].state(robot.joint_names), robot.home)
     assert camera.points(Frame.load("frame.npz").depth).shape == (*camera.grid.shape[:2], 3)
+    _use_map(camera.placed(eye))
     _use_messages(camera)
     _use_twin_camera(camera.placed(eye))
+
+
+def _use_map(camera: Any) -> None:
+    """Occupied and unknown space before a wall; docs/perception.md has the rest."""
+    from apex_ompl.perception import OccupancyMap
+
+    pose = camera.pose
+    middle = pose[:3, 3] + 0.8 * pose[:3, 2]
+    seen = OccupancyMap((middle - 0.2, middle + 0.2), 0.02)
+    seen.integrate(np.full((480, 640), 0.8), camera)
+    before = pose[:3, 3] + 0.7 * pose[:3, 2]
+    assert seen.free.any() and seen.look_up([before]).tolist() == [-1] and len(seen.points()) == seen.occupied.sum()
+    seen.decay(127)
+    assert not seen.occupied.any()
+    seen.clear()
+    assert seen.unknown.all()
 
 
 def _use_messages(camera: Any) -> None:
