@@ -232,8 +232,8 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--driver", metavar="NAME", help="the robot that is driven: mujoco, in physics, or kinematic, an exact one. "
-        "With mujoco a problem whose obstacles stand still is executed to the end of its task, to which of these options "
-        "--seed, --timeout, --out, --film and --json apply",
+        "With mujoco a problem whose obstacles stand still is executed to the end of its task, to which of these "
+        "options --seed, --timeout, --out, --film and --json apply",
     )  # fmt: skip
     parser.add_argument("--film", type=Path, metavar="FILE", help="write a film of a task in physics: .mp4")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the run: .npz or .json")

@@ -20,7 +20,7 @@ def run(parsed: argparse.Namespace) -> int:
     if parsed.driver is not None:
         check_name(parsed.driver, "driver", DRIVERS)
     environment = api.load_environment(parsed.world)
-    if parsed.driver == "mujoco" and isinstance(environment, ScriptedEnvironment) and not environment.problem.moving:
+    if parsed.driver == "mujoco" and isinstance(environment, ScriptedEnvironment) and environment.still:
         from apex_ompl.cli.physics import execute
 
         return execute(environment.problem, parsed)

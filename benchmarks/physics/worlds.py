@@ -51,7 +51,8 @@ KEPT = (
     "tracking_error", "tracking_error_p95", "duration",
 )  # fmt: skip
 HEAD = (
-    "worlds", "driver", "N", "failed % (95 %)", "hit while moving", "as assumed", "hit at rest", "stuck or late",
+    "worlds", "driver", "N", "failed % (95 %)", "hit while moving", "as assumed", "hit at rest",
+    "hit itself or what stands", "not at a goal",
     "time to goal s p50", "error mrad p50", "p95", "most", "over limits", "unguarded steps",
 )  # fmt: skip
 PAIRED = ("against the exact robot", "N", "only it failed", "only the other failed", "difference % (95 %)", "p")
@@ -96,11 +97,12 @@ def row(kind: str, name: str, runs: Sequence[dict[str, Any]]) -> list[Any]:
     hits = [one for one in runs if one["outcome"] == Outcome.HIT_MOVING]
     off = 1e3 * np.array([one.get("tracking_error", np.nan) for one in runs])
     times = [one["time_to_goal"] for one in runs if not failed(one)]
-    others = (Outcome.REACHED, Outcome.HIT_MOVING, Outcome.HIT_AT_REST)
+    others = (Outcome.REACHED, Outcome.HIT_MOVING, Outcome.HIT_AT_REST, Outcome.HIT_STILL)
     middle, high_error, most = np.nanpercentile(off, [50, 95, 100]).tolist()
     return [
         kind, name, count, f"{100 * bad / count:.1f} ({100 * low:.1f} to {100 * high:.1f})", len(hits),
         sum(not one["broken_steps"] for one in hits), sum(one["outcome"] == Outcome.HIT_AT_REST for one in runs),
+        sum(one["outcome"] == Outcome.HIT_STILL for one in runs),
         sum(one["outcome"] not in others for one in runs), f"{np.median(times):.2f}" if times else "-",
         f"{middle:.3g}", f"{high_error:.3g}", f"{most:.3g}", sum(one["outcome"] == Outcome.LIMITS for one in runs),
         int(sum(one["unguarded_steps"] for one in runs)),

@@ -12,6 +12,7 @@ from loops import PROBLEM, ByHand, crossing, line, setup_of, world_of
 from support import benchmark_script
 
 from apex_ompl import LoopSettings, Obstacle, problems, run
+from apex_ompl.api import load_environment
 from apex_ompl.drivers import KinematicDriver
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.loop import Observation
@@ -184,6 +185,12 @@ def test_a_driver_that_needs_time_for_messages_is_late_and_does_not_refuse() -> 
     driver = Slow(robot(), exact().state().positions)
     found = run(problems.load(PROBLEM), "no-network", speed=0.5, settings=SETTINGS, sensor=Camera(), driver=driver)
     assert found.outcome is Outcome.REACHED and found.metrics["late_commands"] > 0.0
+
+
+def test_worlds_whose_obstacles_move_are_told_from_problems_that_stand() -> None:
+    """Tasks are executed in physics only among obstacles that stand (``apex-ompl run --driver mujoco``)."""
+    moving = "turning/vertical/small/900000", "popup/vertical/small/900000", "vertical/moving-small-0.1/900000"
+    assert [load_environment(name).still for name in (*moving, PROBLEM)] == [False, False, False, True]
 
 
 def test_observations_of_a_live_sensor_are_of_its_own_clock() -> None:
