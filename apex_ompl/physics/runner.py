@@ -102,7 +102,7 @@ class TaskRunner:
         return rehearsed(self.robot, trial, motion, self.settings)
 
     def _plan(self, trial: Trial, seed: int) -> TaskResult:
-        """Plan until the way to the goal is as clear as objects may be off, some times at most; return the clearest plan."""
+        """Plan some times, until the way to the goal is as clear as objects may be off; return the clearest plan."""
         known, found = trial.known, list[TaskResult]()
         for k in range(PLANS):
             found.append(
