@@ -23,6 +23,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.util.validation import check_integer, check_name, check_positive
 
 TIMEOUT = 30.0  # of planning [s]
+PLANS, SEEDS = 4, 10**6  # most plans of a task, and the distance of their seeds
 SPILLING = 1.45  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
 
 
@@ -101,8 +102,17 @@ class TaskRunner:
         return rehearsed(self.robot, trial, motion, self.settings)
 
     def _plan(self, trial: Trial, seed: int) -> TaskResult:
-        known = trial.known
-        return self._planner.plan_task(known, timeout=self.timeout, seed=seed, constraints=self._level(known))
+        """Plan some times, until the way to the goal is as clear as objects may be off; return the clearest plan."""
+        known, found = trial.known, list[TaskResult]()
+        for k in range(PLANS):
+            found.append(
+                self._planner.plan_task(
+                    known, timeout=self.timeout, seed=seed + k * SEEDS, constraints=self._level(known)
+                )  # fmt: skip
+            )
+            if found[-1] and found[-1].steps[0].clearance >= self.spread.place:
+                break
+        return max(found, key=lambda plan: plan.steps[0].clearance if plan else -1.0)
 
     def _level(self, problem: Problem) -> tuple[Upright, ...]:
         """Return constraints by which full vessels do not tilt too far on the way to the goal."""

@@ -60,6 +60,8 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ),
     ((0, 1), "run own.yaml --clock real --timeout 3 --out real.json"),
     ((0, 1), "run own.yaml --driver kinematic --timeout 3"),
+    ((0, 1, 2), "run own.yaml --driver mujoco --seed 1 --timeout 20 --out task.npz --json"),  # 2 without MuJoCo
+    ((2,), "run own.yaml --driver mujoco --film task.gif"),
     ((2,), "ros2 own.yaml --ros-args -p speed:=7.0"),  # without ROS as well as with a faulty parameter
     ((0,), "render plan.npz --out plan.png --azimuth 10"),
     ((0,), "plot plan.npz --out plan.svg"),

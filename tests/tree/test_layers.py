@@ -5,7 +5,7 @@ From the top, as CONTRIBUTING has it:
 1. `cli` parses commands; `evaluation` runs OMPL's Benchmark and reports; `viz` draws: renderings, plots, the viewer;
    `ros2` is a node of ROS 2.
 2. `api`: `load_problem`, `setup`, `plan`, `run`; `loop`: environment, sensor, executor and clocks; `loop.replan`:
-   replanners.
+   replanners; `physics`: tasks executed in physics, and judges.
 3. `planning`: `MotionPlanner`, `World`, the steps of a plan; `result`: what a plan returns.
 4. `planners/`, `problems/` (at the top of the tree): planners by name with their parameters; suites, worlds, frozen
    problems.
@@ -51,7 +51,7 @@ LAYERS = [
     {"planners"},
     {"result"},
     {"planning"},
-    {"loop"},
+    {"loop", "physics"},
     {"api"},
     {"evaluation", "ros2", "viz"},
     {"cli"},
