@@ -1,9 +1,10 @@
 """APEX for OMPL: dual-arm planning with latent diffusion, real meshes and proven paths.
 
-``plan`` solves a problem, ``run`` goes to a goal in closed loop while obstacles move, ``load_problem`` reads a problem,
-``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads a trained model, ``time_path`` times any path, ``view``
-shows results in the browser. Planners are in ``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``;
-docs/README.md lists the other packages with public names.
+``plan`` solves a problem, ``plan_task`` goes on with the steps after its goal, ``run`` goes to a goal in closed loop
+while obstacles move, ``load_problem`` reads a problem, ``setup`` gives OMPL's SimpleSetup of one, ``load_model`` reads
+a trained model, ``time_path`` times any path, ``view`` shows results in the browser. Planners are in
+``apex_ompl.planners``, ready-made problems in ``apex_ompl.problems``; docs/README.md lists the other packages with
+public names.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from apex_ompl.util.lazy import lazy_names
 if TYPE_CHECKING:
     from apex_ompl.api import load_problem as load_problem
     from apex_ompl.api import plan as plan
+    from apex_ompl.api import plan_task as plan_task
     from apex_ompl.api import run as run
     from apex_ompl.api import setup as setup
     from apex_ompl.collision.cloud_contact import filter_points as filter_points
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from apex_ompl.moving.settings import LoopSettings as LoopSettings
     from apex_ompl.paths.path import Path as Path
     from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
+    from apex_ompl.planning.task_result import TaskResult as TaskResult
     from apex_ompl.planning.world import World as World
     from apex_ompl.result import PlanResult as PlanResult
     from apex_ompl.result import PlanStatus as PlanStatus
@@ -49,7 +52,7 @@ __version__ = "0.1.0"
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "api": "load_problem plan run setup",
+        "api": "load_problem plan plan_task run setup",
         "collision.cloud_contact": "filter_points",
         "errors": "ApexError",
         "loop.loop": "Loop",
@@ -60,6 +63,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "moving.settings": "LoopSettings",
         "paths.path": "Path",
         "planning.planner": "MotionPlanner",
+        "planning.task_result": "TaskResult",
         "planning.world": "World",
         "result": "PlanResult PlanStatus",
         "robot": "Limits Robot load_robot",

@@ -1,11 +1,11 @@
-"""The Python API: ``load_problem``, ``setup``, ``plan`` and ``run``."""
+"""The Python API: ``load_problem``, ``setup``, ``plan``, ``plan_task`` and ``run``."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 from ompl import geometric as og
 
@@ -14,7 +14,7 @@ from apex_ompl.apex.parameters import NAME
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.planners import AnyPlanner
-from apex_ompl.planning.planner import check_arguments, kept_planner
+from apex_ompl.planning.planner import PlanKeywords, PlanOptions, check_arguments, kept_planner
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from apex_ompl.loop.sensor import Sensor
     from apex_ompl.moving.replanner import Replanner
     from apex_ompl.moving.settings import LoopSettings
+    from apex_ompl.planning.task_result import TaskResult
     from apex_ompl.scene.constraints import Constraint
 
 
@@ -137,6 +138,37 @@ def plan(
             timing=timing, objective=objective, calm_factor=calm_factor, leave_contact=leave_contact,
             constraints=constraints,
         )  # fmt: skip
+
+
+def plan_task(
+    problem: Problem | str | os.PathLike[str], planner: AnyPlanner | None = None, **options: Unpack[PlanKeywords]
+) -> TaskResult:
+    """Plan to the goal of a problem and the steps ``after`` it, prove all of it, and join it to one timed motion.
+
+    As MoveIt's ``MoveGroup.plan`` goes to a goal and its ``Task.plan`` through all stages, :func:`plan` leaves the
+    steps after the goal out, and this function takes them too. Goals from which they cannot be done are not chosen; the
+    status is STEP_FAILED where no other one is found.
+
+    Args:
+        problem: A problem, its name, or its file; without steps after the goal the task is the motion to the goal.
+        planner: As of :func:`plan`.
+        **options: As of :func:`plan`: ``timeout``, for the whole task, ``seed``, ``simplify``, ``params``,
+            ``snapshot``, ``timing``, ``objective``, ``calm_factor``, ``leave_contact``, ``constraints``, which hold up
+            to the goal.
+
+    Returns:
+        The result; its ``trajectory`` goes through all steps, and its ``steps`` have their times and their scenes.
+
+    Raises:
+        ApexError: The problem, a step, the planner or a parameter is unknown or faulty.
+        KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
+    """
+    check_arguments(options.get("timeout", PlanOptions.timeout), options.get("seed", PlanOptions.seed))
+    if planner is not None:
+        planners.chosen(planner, options.get("params"))  # before the problem is read
+    loaded = problem if isinstance(problem, Problem) else load_problem(problem)
+    with kept_planner(loaded.robot) as kept:
+        return kept.plan_task(loaded, planner, **options)
 
 
 def run(

@@ -39,10 +39,11 @@ FIRST = INSIDE + "first"
 
 
 class PlanStatus(StrEnum):
-    """OMPL's planner status names, and three more.
+    """OMPL's planner status names, and four more.
 
     TIMING_FAILED is for a proven path that could not be timed, START_OFF_CONSTRAINT and GOAL_OFF_CONSTRAINT for a start
-    or goals that violate a constraint along the path.
+    or goals that violate a constraint along the path, STEP_FAILED for a task whose steps after the goal cannot be done
+    from any goal that was found.
     """
 
     UNKNOWN = "UNKNOWN"
@@ -58,6 +59,7 @@ class PlanStatus(StrEnum):
     TIMING_FAILED = "TIMING_FAILED"
     START_OFF_CONSTRAINT = "START_OFF_CONSTRAINT"
     GOAL_OFF_CONSTRAINT = "GOAL_OFF_CONSTRAINT"
+    STEP_FAILED = "STEP_FAILED"
 
     @classmethod
     def of(cls, status: ob.PlannerStatus) -> PlanStatus:
@@ -159,6 +161,10 @@ class PlanResult:
         """Return these lines as a table for notebooks."""
         return _summary(self).html
 
+    def _step_rows(self) -> list[tuple[str, str]]:
+        """Return lines on steps after the goal; a plan to a goal has none."""
+        return []
+
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON; numbers that do not exist are None."""
         motion = self.trajectory
@@ -216,7 +222,7 @@ class PlanResult:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> PlanResult:
-        """Read a result that was saved as .npz, .json or .yaml.
+        """Read a result that was saved as .npz, .json or .yaml; of a task the plan to its goal.
 
         Raises:
             MissingFileError: The file cannot be read.
@@ -241,6 +247,7 @@ class PlanResult:
             "constraint_violation": {},
             "constraint_bound": {},
             "nearest_state": None,
+            "goal_time": None,
         }
         data = dict.fromkeys(PROOF) | older | data  # older files lack some
         try:
@@ -249,11 +256,14 @@ class PlanResult:
             nearest = data["nearest_state"]
             knots, names = data["trajectory"], tuple(data["joint_names"])
             arrays = {} if knots is None else {key: np.array(knots[key], dtype=float) for key in KNOTS}
+            whole = to_goal = Trajectory(**arrays, joint_names=names) if arrays else None
+            if whole is not None and data["goal_time"] is not None:  # a task, which goes on after the goal
+                to_goal = whole.before(float(finite_array(data["goal_time"], "goal_time")))
             found = cls(
                 status=_status(data["status"]), reason=data["reason"], robot=data["robot"],
                 path=None if states is None else _path(states, data.get("spline")),
                 problem=Problem.parse(data["problem_file"], str(path)), planner=data["planner"],
-                joint_names=names, trajectory=Trajectory(**arrays, joint_names=names) if arrays else None,
+                joint_names=names, trajectory=to_goal if cls is PlanResult else whole,
                 limit_use=finite_numbers(data["limit_use"], "limit_use"), seed=int(data["seed"]),
                 times=finite_numbers(data["times"], "times"),
                 timing_method=str(data["timing_method"]), checks=int(data["checks"]), solved_by=data["solved_by"],
@@ -266,7 +276,7 @@ class PlanResult:
             )  # fmt: skip
             check_plan(
                 found.problem, robot=found.robot, joint_names=names, status=str(found.status), path=states,
-                motion=found.trajectory,
+                motion=to_goal,
             )  # fmt: skip
         except ParameterError as error:
             raise FileFormatError(str(path), error.name, error.value, f"expected {error.expected}") from error
@@ -314,6 +324,7 @@ def _summary(result: PlanResult) -> Summary:
         )
         uses = ", ".join(f"{name} {share:.3f}" for name, share in result.limit_use.items() if name != "position")
         rows += [("motion", motion), ("limits", f"{uses} used")]
+    rows += result._step_rows()
     for name, bound in result.constraint_bound.items():
         rows.append(("constraint", f"{name}, violated by at most {bound:.3g}"))
     if result.dynamic_obstacles:

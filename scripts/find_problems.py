@@ -25,7 +25,7 @@ from ready_made.specifications import (
     ReachSpecification,
 )
 
-from apex_ompl.api import plan
+from apex_ompl.api import load_problem, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.goals.grasp import HandObjects, close_hands
@@ -208,7 +208,9 @@ def main() -> None:
         if not names or name in names:
             print(name, flush=True)
             problem = _found(specification)
-            with_relative_meshes(problem).save(ROOT / specification.file)
+            file = ROOT / specification.file
+            after = load_problem(file).after if file.exists() else ()
+            with_relative_meshes(problem).model_copy(update={"after": after}).save(file)
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ def check(parsed: argparse.Namespace) -> int:
     """Validate a problem, and print whether start and goal are free."""
     from apex_ompl.api import load_problem
     from apex_ompl.ompl.setup import assemble
+    from apex_ompl.planning.task_world import check_steps
 
     setup = assemble(load_problem(parsed.problem))
     problem = setup.problem
@@ -67,6 +68,9 @@ def check(parsed: argparse.Namespace) -> int:
     for k, fault in enumerate(goal_faults):
         label = "goal" if len(goal_faults) == 1 else f"goal {k}"
         print(f"  {label:<10} {fault or 'free'}{note}")
+    check_steps(setup.robot, problem)
+    for step in problem.after:
+        print(f"  after      {step.title}")
     for text in setup.notes:
         print(f"  note       {text}")
     return 3 if setup.start_fault or all(goal_faults) else 0

@@ -112,9 +112,11 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_plan(commands)  # in the order of the help text
     _add_run(commands)
+    _add_ros2(commands)
     _add_pictures(commands)
     _add_view(commands)
     _add_convert(commands)
+    _add_calibrate(commands)
     _add_benchmark(commands)
     _add_check(commands)
     for name, text in (
@@ -153,6 +155,7 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "--calm-factor", type=float, default=1.1, metavar="FACTOR",
         help="duration of a calm motion as a multiple of the fastest one's (default: %(default)s)",
     )  # fmt: skip
+    parser.add_argument("--to-goal", action="store_true", help="leave out the steps after the goal")
     parser.add_argument("--no-timing", action="store_true", help="leave the path without times")
     parser.add_argument(
         "--timing-method", default="ruckig", metavar="NAME",
@@ -227,6 +230,19 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.set_defaults(run="run:run")
 
 
+def _add_ros2(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("ros2", help="a node of ROS 2 that moves a robot to goals, beside its controllers")
+    parser.add_argument(
+        "source", nargs="?", default="dual_panda_softhand", metavar="ROBOT or PROBLEM",
+        help="a robot or its file, or a problem with obstacles and held objects (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--ros-args", nargs=argparse.REMAINDER, default=[], metavar="...",
+        help="all that follows is for ROS: -p NAME:=VALUE, --params-file FILE, -r NAME:=OTHER, ...",
+    )  # fmt: skip
+    parser.set_defaults(run="ros2:run")
+
+
 def _add_pictures(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("render", help="draw a problem or a saved result, without a display")
     parser.add_argument("source", help=f"a problem as for plan, or {RESULT_HELP}")
@@ -260,6 +276,22 @@ def _add_convert(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--joint", action="append", default=[], metavar="THEIRS=OURS", help="a joint by another name")
     parser.add_argument("--frame", action="append", default=[], metavar="THEIRS=OURS", help="a frame by another name")
     parser.set_defaults(run="commands:convert")
+
+
+def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("calibrate", help="find where a camera is, by frames of a board in many states")
+    parser.add_argument("frames", type=Path, help="folder of frames with color and joint positions")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="camera file to write (.yaml)")
+    parser.add_argument(
+        "--board", default="charuco:9x6:0.025", metavar="BOARD", help="KIND:COLUMNSxROWS:SQUARE by inner corners and "
+        "meters, KIND charuco or chessboard, or tag:SIDE (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--board-link", metavar="LINK", help="that carries the board (default: it stands still)")
+    parser.add_argument("--camera-link", metavar="LINK", help="that carries the camera (default: it stands still)")
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="camera file (default: the frames' own)")
+    parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints that may read a constant too much")
+    parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
+    parser.set_defaults(run="perception:calibrate")
 
 
 def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:

@@ -8,11 +8,14 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from apex_ompl.api import plan
+from apex_ompl.api import load_problem, plan, plan_task
 from apex_ompl.cli.options import LIMITS, name_value_pairs, numbers_by_name
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
+from apex_ompl.planning.planner import check_arguments
+from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.planning.tasks import task_fault
 from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.timing import Timing, Trajectory
@@ -72,8 +75,10 @@ def run(parsed: argparse.Namespace) -> int:
         max_torque=numbers_by_name("--max-torque", parsed.max_torque),
         payload=numbers_by_name("--payload", parsed.payload), max_tool_speed=_tool_speeds(parsed.max_tool_speed),
     )  # fmt: skip
-    result = plan(
-        parsed.problem,
+    check_arguments(parsed.timeout, parsed.seed)
+    problem = load_problem(parsed.problem)
+    result = (plan_task if problem.after and not parsed.to_goal else plan)(
+        problem,
         planner=parsed.planner,
         timeout=parsed.timeout,
         seed=parsed.seed,
@@ -123,9 +128,12 @@ def _prove(result: PlanResult, motion: Trajectory, rate: float) -> None:
     """
     if result.dynamic_obstacles:
         raise ParameterError("--rate", rate, "none among dynamic obstacles, where the motion's own knots are proved")
-    check = full_check(assemble(result.problem).checker, motion)
-    if not check:
-        raise ParameterError("--rate", rate, f"one at which the motion is proved free; it is not, {check.reason}")
+    if isinstance(result, TaskResult):
+        reason = task_fault(result, motion)
+    else:
+        reason = full_check(assemble(result.problem).checker, motion).reason
+    if reason:
+        raise ParameterError("--rate", rate, f"one at which the motion is proved free; it is not, {reason}")
 
 
 def _chosen(given: str | None, robot: Robot) -> list[str]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from apex_ompl.drivers.commands import START_TOLERANCE
 from apex_ompl.drivers.controllers import Controllers
+from apex_ompl.drivers.guard import Guard
 from apex_ompl.drivers.kinematic import KinematicDriver
 from apex_ompl.drivers.library import rosbags
 from apex_ompl.errors import ParameterError
@@ -45,7 +46,7 @@ class BagDriver(KinematicDriver):
     def __init__(
         self, robot: Robot, path: str | PathLike[str], controllers: Mapping[str, Sequence[str]] | str = "arms",
         state: Array | None = None, *, renamed: Mapping[str, str] | None = None, zero: float = 0.0, rate: float = RATE,
-        tolerance: float = START_TOLERANCE,
+        tolerance: float = START_TOLERANCE, guard: Guard | None = None,
     ) -> None:  # fmt: skip
         """Rest in a state, and begin a bag.
 
@@ -58,6 +59,7 @@ class BagDriver(KinematicDriver):
             zero: Time in the bag at which the driver's clock starts, since 1970 [s].
             rate: Joint states a second [Hz].
             tolerance: Largest distance of the start of a motion from the commanded position [rad].
+            guard: How far the robot may be from its motion.
 
         Raises:
             MissingFileError: The extra ``bags`` is not installed.
@@ -65,7 +67,7 @@ class BagDriver(KinematicDriver):
         """
         check_positive(rate, "rate", "a positive number of states a second")
         check_number(zero, "zero", 0.0)
-        super().__init__(robot, state, tolerance=tolerance)
+        super().__init__(robot, state, tolerance=tolerance, guard=guard)
         self.path = Path(path)
         self.controllers = Controllers(self.names, controllers, renamed)
         bags = rosbags()
@@ -87,21 +89,18 @@ class BagDriver(KinematicDriver):
         super().advance(until)
         self._write_states(until)
 
-    def send(self, motion: Trajectory, at: float) -> None:
-        """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`), and write its messages."""
-        super().send(motion, at)
-        self._write_motion(motion, at)
-
-    def stop(self) -> None:
-        """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
-        with self._open():
-            self._write_motion(self._commands.stop(self.time), self.time)
-
     def close(self) -> None:
         """Complete the bag; other calls after it raise an ApexError."""
         if not self._closed:
             self._writer.close()
         super().close()
+
+    def _send(self, motion: Trajectory, at: float) -> None:
+        super()._send(motion, at)
+        self._write_motion(motion, at)
+
+    def _stop(self) -> None:
+        self._write_motion(self._commands.stop(self.time), self.time)
 
     def _stamp(self, time: float) -> Any:
         sec, nanosec = divmod(self._zero + round(time * NANOSECONDS), NANOSECONDS)
@@ -134,6 +133,7 @@ class BagDriver(KinematicDriver):
         self._count = last + 1
         for time, q, v in zip(times.tolist(), *self._commands.states(times)[:2], strict=True):
             message = self._types.types[STATE](
-                header=self._header(time), name=self.controllers.ros_names, position=q, velocity=v, effort=np.empty(0)
-            )
+                header=self._header(time), name=self.controllers.ros_names, position=q + self._pushed, velocity=v,
+                effort=np.empty(0),
+            )  # fmt: skip
             self._write(STATES, STATE, time, message)

@@ -1,4 +1,4 @@
-"""The motions that were sent to a driver, and the state that they command at a time."""
+"""The motions that were sent to a driver, the state that they command at a time, and how far the robot is from it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from bisect import bisect_right
 
 import numpy as np
 
-from apex_ompl.errors import ParameterError
+from apex_ompl.drivers.driver import DriverState
+from apex_ompl.drivers.guard import STILL, Bounds
+from apex_ompl.errors import DriverError, ParameterError
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.rests import AT_REST
 from apex_ompl.timing.trajectory import LIMIT_ROOM, Trajectory
@@ -26,25 +28,24 @@ class Commands:
         names: Names of the joints.
         limits: Limits that motions keep.
         tolerance: Largest distance of the start of a motion from the commanded position [rad].
+        fault: Where the robot left its motion, in a sentence, after which motions are refused; else empty.
     """
 
     def __init__(
-        self, names: tuple[str, ...], limits: Limits, position: Array, tolerance: float = START_TOLERANCE
+        self, names: tuple[str, ...], limits: Limits, position: Array, tolerance: float = START_TOLERANCE,
+        bounds: Bounds | None = None,
     ) -> None:  # fmt: skip
-        """Command rest at a position, shape (dof,), from time 0 on.
+        """Command rest at a position, shape (dof,), from time 0 on, for a robot that is guarded by ``bounds``.
 
         Raises:
             ParameterError: The position has another shape or a number that is not finite, or the tolerance is not a
                 positive number.
         """
         self.names, self.limits = names, limits
-        self.tolerance = tolerance
+        self.tolerance, self.fault = tolerance, ""
+        self._bounds = bounds
         check_positive(tolerance, "tolerance")
-        position = finite_array(position, "position")
-        check_array(position, (len(names),), "position")
-        still = np.zeros((1, len(names)))
-        self._starts = [0.0]
-        self._motions = [Trajectory(np.zeros(1), position[None], still, still, names)]
+        self._starts, self._motions = [0.0], [self._still(position)]
 
     @property
     def end(self) -> float:
@@ -62,13 +63,21 @@ class Commands:
             begin = max(begin, end)
         return found
 
-    def send(self, motion: Trajectory, at: float, now: float) -> None:
+    def send(self, motion: Trajectory, at: float, now: float, measured: DriverState | None = None) -> None:
         """Add a motion (:meth:`apex_ompl.drivers.driver.Driver.send`); the time is ``now`` [s]."""
+        if self.fault:
+            raise DriverError(f"the robot was stopped, since {self.fault}; recover() takes up motions again")
         at = float(finite_array(at, "at"))
         if at < now - CLOCK_ROUNDING:
             raise ParameterError("at", at, f"a time that is not over, {now:g} s or later")
         self._check(motion)
         self._check_start(motion, at)
+        if measured is not None and self._bounds is not None:
+            self._check_measured(motion, at, measured, self._bounds.start)
+        self.add(motion, at)
+
+    def add(self, motion: Trajectory, at: float) -> None:
+        """Replace what is commanded from a time on [s] by a motion that was checked."""
         kept = bisect_right(self._starts, at - CLOCK_ROUNDING)
         self._starts[kept:], self._motions[kept:] = [at], [motion]
 
@@ -88,10 +97,62 @@ class Commands:
         self._motions.append(rest)
         return rest
 
+    def watch(self, measured: DriverState) -> bool:
+        """Compare a measured state with the one that is commanded at its stamp, and set :attr:`fault` where it is off.
+
+        Returns:
+            Whether it is, for the first time: the robot is to be stopped.
+        """
+        if self.fault or self._bounds is None:
+            return False
+        off = np.abs(measured.positions - self.states(np.array([measured.stamp]))[0, 0])
+        if (off <= self._bounds.tracking).all():
+            return False
+        k = int(np.argmax(off / self._bounds.tracking))
+        most = f"more than {self._bounds.tracking[k]:g}"
+        self.fault = f"{self.names[k]} was {off[k]:.3g} off its commanded position at {measured.stamp:.3f} s, {most}"
+        return True
+
+    def recover(self, measured: DriverState, now: float, adopt: bool = True) -> Array:
+        """Forget the fault.
+
+        Args:
+            measured: The measured state.
+            now: The time [s].
+            adopt: Whether rest in the measured position is commanded from now on. Otherwise the robot must be back at
+                the commanded one, to the guard's distance of a start.
+
+        Returns:
+            The commanded position, shape (dof,).
+
+        Raises:
+            DriverError: The robot moves, or is not back.
+        """
+        speed = np.abs(measured.velocities)
+        if now < self.end or not (speed <= STILL).all():
+            k = int(np.argmax(speed))
+            raise DriverError(f"the robot moves, {self.names[k]} at {speed[k]:.3g} rad/s, expected rest")
+        if adopt:
+            self._starts, self._motions = [now], [self._still(measured.positions)]
+        elif self._bounds is not None:
+            off = np.abs(measured.positions - self.states(np.array([now]))[0, 0])
+            if not (off <= self._bounds.start).all():
+                k = int(np.argmax(off / self._bounds.start))
+                most = f"expected at most {self._bounds.start[k]:g}"
+                raise DriverError(f"{self.names[k]} is still {off[k]:.3g} off its commanded position, {most}")
+        self.fault = ""
+        found: Array = self.states(np.array([now]))[0, 0]
+        return found
+
     def forget(self, now: float) -> None:
         """Drop motions that were replaced before a time [s], which ``states`` is not asked for again."""
         k = max(bisect_right(self._starts, now) - 1, 0)
         del self._starts[:k], self._motions[:k]
+
+    def _still(self, position: Array) -> Trajectory:
+        position, still = finite_array(position, "position"), np.zeros((1, len(self.names)))
+        check_array(position, (len(self.names),), "position")
+        return Trajectory(np.zeros(1), position[None], still, still, self.names)
 
     def _check(self, motion: Trajectory) -> None:
         """Check a motion by itself: joints, finite numbers, limits, rest at the end."""
@@ -125,3 +186,12 @@ class Commands:
                 k = int(np.argmax(off / most))
                 found = f"a {name} of {self.names[k]} that is {off[k]:.3g} from the commanded one"
                 raise ParameterError("motion", found, f"a start within {most[k]:.3g} of it at {at:g} s")
+
+    def _check_measured(self, motion: Trajectory, at: float, measured: DriverState, most: Array) -> None:
+        """Check that a motion starts where the robot is: off by what it is off now, which it carries along."""
+        commanded = self.states(np.array([measured.stamp, max(at, measured.stamp)]))[0]
+        off = np.abs(motion.positions[0] - commanded[1] - (measured.positions - commanded[0]))
+        if not (off <= most).all():
+            k = int(np.argmax(off / most))
+            where = f"{self.names[k]} is {off[k]:.3g} off the start of the motion"
+            raise DriverError(f"{where} as measured at {measured.stamp:.3f} s, expected at most {most[k]:g}")

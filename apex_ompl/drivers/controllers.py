@@ -22,11 +22,13 @@ class ControllerMotion(NamedTuple):
     """What a controller gets of a motion.
 
     Attributes:
+        controller: Its name.
         topic: Where it listens.
         joints: Names of its joints in ROS.
         points: The states between which polynomials of fifth degree are the motion.
     """
 
+    controller: str
     topic: str
     joints: list[str]
     points: list[Point]
@@ -74,8 +76,8 @@ class Controllers:
         near = np.diff(motion.times).min(initial=CLOSEST) < CLOSEST
         times = spaced(motion.times, CLOSEST) if near else on_grid(motion.times)
         ticks, states = np.rint(times * NANOSECONDS).astype(np.int64), motion.states(np.minimum(times, motion.duration))
-        for topic, joints in zip(self.topics, self.joints.values(), strict=True):
+        for topic, (name, joints) in zip(self.topics, self.joints.items(), strict=True):
             columns = [self._names.index(name) for name in joints]
             rows = np.moveaxis(states[:, :, columns], 1, 0).tolist()
             points = [(tick, *row) for tick, row in zip(ticks.tolist(), rows, strict=True)]
-            yield ControllerMotion(topic, [self.ros_names[k] for k in columns], points)
+            yield ControllerMotion(name, topic, [self.ros_names[k] for k in columns], points)

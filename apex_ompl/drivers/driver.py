@@ -28,6 +28,10 @@ class DriverState:
 class Driver(Protocol):
     """A robot that follows motions. At the start, and after the end of a motion, it is at rest.
 
+    Where the measured position is further from the commanded one than the driver's guard allows
+    (:class:`apex_ompl.drivers.guard.Guard`), or where a part of the robot fails, the driver stops as :meth:`stop`
+    does, :attr:`fault` says why, and motions are refused until :meth:`recover`.
+
     Attributes:
         names: Names of the joints, in the order of states.
         limits: Limits of the joints, which each motion must keep.
@@ -35,6 +39,21 @@ class Driver(Protocol):
 
     names: tuple[str, ...]
     limits: Limits
+
+    @property
+    def time(self) -> float:
+        """Time on the driver's clock [s]."""
+        ...
+
+    @property
+    def end(self) -> float:
+        """Time from which on rest is commanded [s]."""
+        ...
+
+    @property
+    def fault(self) -> str:
+        """Why the driver stopped, in a sentence; else empty."""
+        ...
 
     def state(self) -> DriverState:
         """Return the measured state."""
@@ -49,12 +68,25 @@ class Driver(Protocol):
 
         Raises:
             ApexError: The time is over, or the motion is of other joints, has a number that is not finite, exceeds the
-                limits, does not end at rest, or does not start in the state that is commanded then.
+                limits, does not end at rest, or does not start in the state that is commanded then, or the robot is
+                further from its start than the guard allows, or there is a fault.
         """
         ...
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
+        ...
+
+    def recover(self) -> Array:
+        """Take up motions again after a fault.
+
+        Returns:
+            The position in which the next motion starts, shape (dof,): the measured one, where the robot can be
+            commanded to rest there.
+
+        Raises:
+            ApexError: The robot moves, or cannot be commanded.
+        """
         ...
 
     def close(self) -> None:

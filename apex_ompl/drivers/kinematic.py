@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
+from apex_ompl.drivers.guard import Guard, part_of
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot.model import Robot
 from apex_ompl.timing.trajectory import Trajectory
@@ -19,7 +20,7 @@ from apex_ompl.util.validation import check_array, check_number, finite_array
 
 
 class KinematicDriver:
-    """A robot that is exactly where it is commanded to be.
+    """A robot that is exactly where it is commanded to be, and off by as much as it was pushed (:meth:`push`).
 
     Without a clock of the caller's its time stands still until :meth:`advance`. Its methods may be called from several
     threads.
@@ -31,23 +32,28 @@ class KinematicDriver:
 
     def __init__(
         self, robot: Robot, state: Array | None = None, *, clock: Callable[[], float] | None = None,
-        tolerance: float = START_TOLERANCE,
+        tolerance: float = START_TOLERANCE, guard: Guard | None = None, joints: Sequence[str] | None = None,
     ) -> None:  # fmt: skip
         """Rest in a state.
 
         Args:
             robot: The robot.
-            state: The state, shape (dof,); by default the home of the robot.
+            state: The state of all joints, shape (dof,); by default the home of the robot.
             clock: Returns the time, which never decreases [s], such as ``time.monotonic``.
             tolerance: Largest distance of the start of a motion from the commanded position [rad].
+            guard: How far the robot may be from its motion.
+            joints: The joints that it drives; by default all.
 
         Raises:
-            ParameterError: The state has another shape or a number that is not finite, or is outside the limits.
+            ParameterError: A joint is unknown or given twice, or the state has another shape or a number that is not
+                finite, or is outside the limits.
         """
         at = finite_array(robot.home if state is None else state, "state")
         check_array(at, (robot.dof,), "state")
-        self.names, self.limits = robot.joint_names, robot.limits
-        self._commands = Commands(self.names, self.limits, at, tolerance)
+        part = part_of(robot, joints, guard)
+        self.names, self.limits = part.names, part.limits
+        self._commands = Commands(part.names, part.limits, at[part.columns], tolerance, part.bounds)
+        self._pushed = np.zeros(len(part.names))
         fault = robot.limit_fault(at)
         if fault:
             raise ParameterError("state", fault, "a state within the limits")
@@ -80,27 +86,65 @@ class KinematicDriver:
                 raise ParameterError("until", until, "no call: the clock is the caller's")
             self._time = until
 
+    @property
+    def fault(self) -> str:
+        """Why the driver stopped, in a sentence; else empty."""
+        return self._commands.fault
+
     def state(self) -> DriverState:
-        """Return the commanded state."""
+        """Return the commanded state, off by as much as the robot was pushed."""
         with self._open():
             now = self.time
             self._commands.forget(now)
-            position, velocity, _ = self._commands.states(np.array([now]))[:, 0]
-            return DriverState(now, position, velocity)
+            return self._measured(now)
 
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         with self._open():
-            self._commands.send(motion, at, self.time)
+            self._send(motion, at)
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
         with self._open():
-            self._commands.stop(self.time)
+            self._stop()
+
+    def push(self, by: Array) -> None:
+        """Push the robot off its commanded position, as somebody might: what watches a robot is tested so.
+
+        Args:
+            by: How far it is off from now on, shape (dof,) [rad; synergies 0..1].
+
+        Raises:
+            ParameterError: It has another shape.
+        """
+        with self._open():
+            check_array(np.asarray(by), (len(self.names),), "by")
+            self._pushed = np.array(by, np.float64)  # NaN as of a sensor that fails
+            if self._commands.watch(self._measured(self.time)):
+                self._stop()
+
+    def recover(self) -> Array:
+        """Rest where the robot is, and take up motions again (:meth:`apex_ompl.drivers.driver.Driver.recover`)."""
+        with self._open():
+            now = self.time
+            found = self._commands.recover(self._measured(now), now)
+            self._pushed[:] = 0.0
+            return found
 
     def close(self) -> None:
         """End it; other calls after it raise an ApexError."""
         self._closed = True
+
+    def _measured(self, now: float) -> DriverState:
+        position, velocity, _ = self._commands.states(np.array([now]))[:, 0]
+        return DriverState(now, position + self._pushed, velocity)
+
+    def _send(self, motion: Trajectory, at: float) -> None:
+        now = self.time
+        self._commands.send(motion, at, now, self._measured(now))
+
+    def _stop(self) -> None:
+        self._commands.stop(self.time)
 
     def _open(self) -> threading.Lock:
         if self._closed:

@@ -1,8 +1,9 @@
-"""The optional libraries: MuJoCo, the client library of ROS 2, and rosbags."""
+"""The optional libraries: MuJoCo, the client library of ROS 2, rosbags, and those of Franka's arms."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from ctypes.util import find_library
 from importlib import import_module
 from types import SimpleNamespace
@@ -38,12 +39,7 @@ def rclpy() -> Any:
         "rclpy.qos": ("qos_profile_sensor_data",), "rclpy.time": ("Time",), "sensor_msgs.msg": ("JointState",),
         "trajectory_msgs.msg": ("JointTrajectory", "JointTrajectoryPoint"),
     }  # fmt: skip
-    try:
-        with unforked():
-            found = {name: getattr(import_module(module), name) for module, names in places.items() for name in names}
-    except ImportError as error:
-        raise MissingFileError("rclpy", "package for ROS 2", "install the extra: apex-ompl[ros2]") from error
-    return SimpleNamespace(**found)
+    return names_of(places, "rclpy", "ROS 2", "ros2")
 
 
 def rosbags() -> Any:
@@ -60,3 +56,45 @@ def rosbags() -> Any:
     return SimpleNamespace(
         Writer=bags.Writer, plugin=bags.StoragePlugin, types=types.get_typestore(types.Stores.ROS2_JAZZY)
     )
+
+
+def panda_py() -> Any:
+    """Return what drivers use of ``panda_py``, as one namespace.
+
+    Raises:
+        MissingFileError: The package ``panda-python`` is not installed.
+    """
+    places = {
+        "panda_py": ("Panda",), "panda_py.controllers": ("JointPosition",), "panda_py.libfranka": ("RealtimeConfig",),
+    }  # fmt: skip
+    return names_of(places, "panda_py", "Franka's arms", "panda")
+
+
+def franky() -> Any:
+    """Return what drivers use of ``franky``, as one namespace.
+
+    Raises:
+        MissingFileError: The package ``franky-control`` is not installed.
+    """
+    places = {"franky": ("JointImpedanceTracker", "RealtimeConfig", "Robot")}
+    return names_of(places, "franky", "Franka's arms", "fr3")
+
+
+def names_of(places: Mapping[str, tuple[str, ...]], package: str, purpose: str, extra: str) -> Any:
+    """Return names of an optional package as one namespace.
+
+    Args:
+        places: The names by the modules that have them.
+        package: Name of the package.
+        purpose: What it is for.
+        extra: The extra that installs it.
+
+    Raises:
+        MissingFileError: It is not installed.
+    """
+    try:
+        with unforked():
+            found = {name: getattr(import_module(module), name) for module, names in places.items() for name in names}
+    except ImportError as error:
+        raise MissingFileError(package, f"package for {purpose}", f"install the extra: apex-ompl[{extra}]") from error
+    return SimpleNamespace(**found)

@@ -15,6 +15,7 @@ import numpy as np
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
+from apex_ompl.drivers.guard import Guard
 from apex_ompl.drivers.twin import Twin, TwinSettings, held_loads
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.robot.dynamics import Dynamics
@@ -82,6 +83,7 @@ class MujocoDriver:
     def __init__(
         self, robot: Robot, problem: Problem | None = None, *, state: Array | None = None,
         settings: TwinSettings | None = None, tolerance: float = START_TOLERANCE, assumed: Problem | None = None,
+        guard: Guard | None = None,
     ) -> None:  # fmt: skip
         """Build the model.
 
@@ -92,6 +94,7 @@ class MujocoDriver:
             settings: Settings of the model.
             tolerance: Largest distance of the start of a motion from the commanded position [rad].
             assumed: What the controller takes to be held, by default that of the problem.
+            guard: How far the robot may be from its motion.
 
         Raises:
             ApexError: As :class:`apex_ompl.drivers.twin.Twin`, or the state has another shape.
@@ -99,7 +102,7 @@ class MujocoDriver:
         if state is None:
             state = robot.home if problem is None else problem.start_state(robot.joint_names)
         self.robot, self.names, self.limits = robot, robot.joint_names, robot.limits
-        self._commands = Commands(self.names, self.limits, state, tolerance)
+        self._commands = Commands(self.names, self.limits, state, tolerance, (guard or Guard()).bounds(robot))
         self.twin = twin = Twin(robot, problem, settings)
         self.data = twin.data(finite_array(state, "state"))
         loads = twin.loads if assumed is None else held_loads(robot, assumed, twin.settings)
@@ -128,12 +131,22 @@ class MujocoDriver:
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         self._check_open()
-        self._commands.send(motion, at, self.time)
+        self._commands.send(motion, at, self.time, self.state())
 
     def stop(self) -> None:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
         self._check_open()
         self._commands.stop(self.time)
+
+    @property
+    def fault(self) -> str:
+        """Why the driver stopped, in a sentence; else empty."""
+        return self._commands.fault
+
+    def recover(self) -> Array:
+        """Hold the measured position, and take up motions again (:meth:`apex_ompl.drivers.driver.Driver.recover`)."""
+        self._check_open()
+        return self._commands.recover(self.state(), self.time)
 
     def close(self) -> None:
         """Release the model and what draws it."""
@@ -152,8 +165,8 @@ class MujocoDriver:
         count = round((until - self.time) / self.twin.settings.step)
         if not 0 <= count <= MOST_STEPS:
             raise ParameterError("until", until, f"a time from {self.time:g} s on, at most {MOST_STEPS} steps ahead")
-        for begin in range(0, count, BLOCK):
-            self._advance(min(BLOCK, count - begin))
+        while count:
+            count -= self._advance(min(BLOCK, count))
 
     @property
     def execution(self) -> Execution:
@@ -230,8 +243,8 @@ class MujocoDriver:
         if self._closed:
             raise ParameterError("driver", "one that was closed", "an open one")
 
-    def _advance(self, count: int) -> None:
-        """Simulate some steps."""
+    def _advance(self, count: int) -> int:
+        """Simulate some steps, fewer where the robot is stopped, and return their number."""
         twin, data = self.twin, self.data
         times = np.asarray((self._steps + np.arange(count)) * twin.settings.step, np.float64)
         self._commands.forget(float(times[0]) - twin.settings.step)
@@ -243,6 +256,10 @@ class MujocoDriver:
         rows = np.stack([q, np.empty_like(q), own, np.empty_like(q)], axis=2)
         for k, row in enumerate(rows):
             row[:, 1] = data.qpos[twin.q]
+            if self._commands.watch(DriverState(float(times[k]), row[:, 1], data.qvel[twin.v])):
+                self._commands.stop(float(times[k]))  # what follows is commanded anew
+                times, rows = times[:k], rows[:k]
+                break
             data.ctrl[twin.u] = feedforward[k] - twin.kp * row[:, 1] - twin.kd * data.qvel[twin.v]
             twin.move_obstacles(data, float(times[k]))
             twin.step(data)
@@ -251,4 +268,5 @@ class MujocoDriver:
                 self._contacts[pair] = max(depth, self._contacts.get(pair, 0.0))
         self._times.append(times)
         self._parts.append(rows)
-        self._steps += count
+        self._steps += len(times)
+        return len(times)

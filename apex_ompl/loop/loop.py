@@ -121,7 +121,7 @@ class Loop:
         self._before = Decided.of(self._control.executor)
         self._waiting: list[Observation] = []
         self._zero: float | None = None
-        self._now, self._next, self._known = -math.inf, 0, 0.0
+        self._now, self._next, self._known, self._measured = -math.inf, 0, 0.0, False
         self._record: RunRecord | None = None
 
     def __repr__(self) -> str:
@@ -201,8 +201,8 @@ class Loop:
         Args:
             now: Time on the caller's clock [s]; it starts at the first step.
             state: The measured positions of the joints, shape (dof,), or None where they are not known now. Where a
-                joint is further than the tolerance from where it should be, and where no state was usable for
-                ``settings.silence``, the robot stops and the run ends.
+                joint is further than the tolerance from where it should be, and, once there was a state, where none was
+                usable for ``settings.silence``, the robot stops and the run ends.
 
         Raises:
             ParameterError: The time is not finite.
@@ -255,12 +255,12 @@ class Loop:
         """Stop where the robot is not where it should be, or where that was not known for too long."""
         wanted = self._control.executor.state(now)
         if state is not None and np.shape(state) == wanted.shape and np.isfinite(state).all():
-            self._known = now
+            self._known, self._measured = now, True
             off = np.abs(np.asarray(state) - wanted)
             k = int(off.argmax())
             if off[k] > self._tolerance:
                 self.abort(f"{self.joint_names[k]} is {off[k]:.3g} rad from where it should be")
-        elif state is not None and now - self._known > self.settings.silence:
+        elif (state is not None or self._measured) and now - self._known > self.settings.silence:
             self.abort(f"no state of the robot was usable for {self.settings.silence:g} s")
 
     def _end(self, why: str) -> None:

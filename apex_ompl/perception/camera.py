@@ -163,6 +163,28 @@ class Camera(StrictModel):
         x, y = np.moveaxis(self._distorted(flat), -1, 0)
         return np.stack([self.focal[0] * x + self.center[0], self.focal[1] * y + self.center[1]], axis=-1)
 
+    def projection_jacobian(self, points: ArrayLike) -> Array:
+        """Return the derivatives of :meth:`project` by the points, shape (..., 2, 3) [pixels/m].
+
+        Args:
+            points: Points in front of the camera, shape (..., 3) [m].
+        """
+        k1, k2, p1, p2, k3 = self.distortion
+        given = np.asarray(points, float)
+        z = given[..., 2]
+        x, y = given[..., 0] / z, given[..., 1] / z
+        squared = x * x + y * y
+        radial = 1.0 + squared * (k1 + squared * (k2 + squared * k3))
+        slope = 2.0 * (k1 + squared * (2.0 * k2 + 3.0 * squared * k3))  # of the radial factor by the square, twice
+        across = slope * x * y + 2.0 * (p1 * x + p2 * y)
+        flat = np.empty((*x.shape, 2, 2))
+        flat[..., 0, 0] = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        flat[..., 0, 1] = flat[..., 1, 0] = across
+        flat[..., 1, 1] = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        flat *= np.asarray(self.focal)[:, None]
+        depth = -(flat[..., 0] * x[..., None] + flat[..., 1] * y[..., None])
+        return np.asarray(np.concatenate([flat, depth[..., None]], axis=-1) / z[..., None, None])
+
     def rays(self, pixels: ArrayLike) -> Array:
         """Return the points of the plane z = 1 m of the optical frame that are seen at pixels.
 

@@ -89,7 +89,7 @@ def line_query(
             raise ParameterError(f"pose[{k}]", ", ".join(waypoint), f"poses of {', '.join(names)}")
     frames = [frame_of(robot, name, checker.held, "frame of a line") for name in names]
     q = robot.within_limits(start)
-    tools, held_by = _in_both_hands(checker, _tools(robot, names, frames), q)
+    tools, held_by = _in_both_hands(checker, tools_of(robot, names, frames), q)
     rotation, point = Tools(checker.kernel, tools).poses(q[None])
     poses = np.tile(np.eye(4), (1 + len(waypoints), len(tools), 1, 1))
     poses[0, :, :3, :3], poses[0, :, :3, 3] = rotation[0], point[0]
@@ -101,6 +101,26 @@ def line_query(
     if how is not None:
         how.motion_limits(robot, tuple(checker.held.values()))  # checked before planning
     return LineQuery(problem(goals), q, tools, names, poses, float(blend), speed, how)
+
+
+def tools_of(robot: Robot, names: Sequence[str], frames: Sequence[Frame]) -> tuple[Tool, ...]:
+    """Return the tools of frames by name, each moved by joints of its own.
+
+    Raises:
+        ParameterError: A frame is moved by fewer than six joints, or two share a joint.
+    """
+    taken, tools = dict[int, str](), list[Tool]()
+    for name, frame in zip(names, frames, strict=True):
+        tool = _tool(robot, name, frame.link, frame.pose)
+        if len(tool.columns) < LEAST_JOINTS:
+            raise ParameterError("frame", name, f"one that {LEAST_JOINTS} joints or more move, not {len(tool.columns)}")
+        for column in tool.columns.tolist():
+            if column in taken:
+                shared = f"{robot.joint_names[column]} moves {taken[column]} too"
+                raise ParameterError("frame", name, f"frames of arms that share no joint ({shared})")
+            taken[column] = name
+        tools.append(tool)
+    return tuple(tools)
 
 
 def _several(pose: Waypoint | Sequence[Waypoint]) -> list[Any]:
@@ -213,26 +233,6 @@ def _arm(robot: Robot, link: str) -> list[int]:
     links, synergies = Links.of(robot), {hand.synergy for hand in robot.hands.values()}
     joint, _ = links.frame(link, pin.SE3.Identity())
     return [k for k in links.moved(joint) if robot.joint_names[k] not in synergies]
-
-
-def _tools(robot: Robot, names: Sequence[str], frames: Sequence[Frame]) -> tuple[Tool, ...]:
-    """Return the tools of frames by name.
-
-    Raises:
-        ParameterError: A frame is moved by fewer than six joints, or two share a joint.
-    """
-    taken, tools = dict[int, str](), list[Tool]()
-    for name, frame in zip(names, frames, strict=True):
-        tool = _tool(robot, name, frame.link, frame.pose)
-        if len(tool.columns) < LEAST_JOINTS:
-            raise ParameterError("frame", name, f"one that {LEAST_JOINTS} joints or more move, not {len(tool.columns)}")
-        for column in tool.columns.tolist():
-            if column in taken:
-                shared = f"{robot.joint_names[column]} moves {taken[column]} too"
-                raise ParameterError("frame", name, f"frames of arms that share no joint ({shared})")
-            taken[column] = name
-        tools.append(tool)
-    return tuple(tools)
 
 
 def _tool(robot: Robot, name: str, link: str, pose: Array) -> Tool:

@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from apex_ompl.planning.line_query import Waypoint
     from apex_ompl.planning.lines import LineResult
     from apex_ompl.planning.query import Group, State, Target
+    from apex_ompl.planning.task_result import TaskResult
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
     from apex_ompl.scene.bodies import Obstacle
@@ -245,6 +246,35 @@ class MotionPlanner:
             with unforked():
                 self.world.load(problem)
             return self._plan(problem, planner, started, PlanOptions(**options))
+
+    def plan_task(
+        self, problem: Problem, planner: AnyPlanner | None = None, **options: Unpack[ProblemKeywords]
+    ) -> TaskResult:
+        """Put the bodies of a problem into the world, and plan to its goal and the steps after it.
+
+        The world is then that on the way to the goal.
+
+        Args:
+            problem: A problem of this robot.
+            planner: A planner; see :func:`apex_ompl.plan`.
+            **options: As of :meth:`plan`, ``group`` among them; ``timeout`` is for the whole task.
+
+        Raises:
+            ApexError: The problem, a step, the planner, a parameter or the name of an option is faulty.
+        """
+        check_options(options, OPTIONS)
+        with running(), self._lock:
+            with unforked():
+                from apex_ompl.planning.tasks import plan_task
+
+                self.world.load(problem)
+            given = PlanOptions(**options)
+
+            def plan_to(goals: Problem, timeout: float, first: bool) -> PlanResult:
+                now = given if first else _from_rest(given)
+                return self._plan(goals, planner, time.perf_counter(), replace(now, timeout=timeout))
+
+            return plan_task(self._checker, problem, given, plan_to)
 
     def _plan(
         self, problem: Problem, planner: AnyPlanner | None, started: float, options: PlanOptions
@@ -499,6 +529,14 @@ class MotionPlanner:
         made = CollisionChecker(self.robot, scene.values(), held.values(), pairs)
         self._left = made if kept else self._left
         return made
+
+
+def _from_rest(options: PlanOptions) -> PlanOptions:
+    """Return the options of a later motion of a task: from rest, without contact to leave, and unconstrained."""
+    timing = options.timing
+    if not isinstance(timing, bool):
+        timing = replace(timing, start_velocity=(), start_acceleration=(), minimum_duration=0.0)
+    return replace(options, timing=timing, leave_contact=0.0, constraints=())
 
 
 def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:

@@ -85,6 +85,15 @@ class Dynamics:
         torques[:, self.robot.state_order] = found
         return torques
 
+    def inertias(self, q: Array) -> Array:
+        """Return the inertia matrices M(q) of the planned joints, shape (N, dof, dof) [kg m^2], for states (N, dof)."""
+        model, data, order = self._model, self._data, self.robot.state_order
+        found = np.empty((len(q), len(order), len(order)))
+        for matrix, row in zip(found, self.robot.to_pinocchio(q), strict=True):
+            upper = np.triu(pin.crba(model, data, row))
+            matrix[np.ix_(order, order)] = upper + np.triu(upper, 1).T
+        return found
+
     def along(self, q: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
         """Return the torques along a curve q(s), tau = m u + c x + g with x = (ds/dt)^2 and u = d^2s/dt^2.
 

@@ -15,101 +15,25 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from apex_ompl.errors import FileFormatError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.robot.config import resolve
 from apex_ompl.robot.model import link_of
-from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields, pose_matrix
+from apex_ompl.robot.moveit_messages import ADD, REMOVE, MessageReader, RobotMessageReader
+from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.constraints import Constraint, FixedOrientation, ToolRegion, Upright
-from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.scene.problem import Goal, PoseTarget, Problem
 from apex_ompl.types import Array
-from apex_ompl.util.schema import StrictModel, read_yaml, validate
-from apex_ompl.util.validation import is_integer, is_number
+from apex_ompl.util.schema import read_yaml, validate
 
 MATRIX = "allowed_collision_matrix"
-PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
-ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
-WORLD_FRAMES = ("", "world", "map")
 SIDES = ("above", "below")  # of a joint's tolerances
 TURN = 3.14  # tolerance of an angle from which turns about an axis are free [rad]
 EXACT_ANGLE = 0.01  # tolerance up to which an orientation counts as fixed [rad]
 SAME_POINT = 1e-4  # largest distance between points that count as the same [m]
-RecordT = TypeVar("RecordT", bound=StrictModel)
 HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allowed_planning_time", "pipeline_id")
-
-
-@dataclass
-class MessageReader:
-    """Reads parts of the messages in a file; all methods raise a FileFormatError where a part has another form."""
-
-    file: Path
-
-    def fail(self, where: str, value: object, expected: str) -> FileFormatError:
-        """Return the error of a value in the file."""
-        return FileFormatError(str(self.file), where, value, expected)
-
-    def section(self, data: Mapping[str, Any], key: str, where: str = "") -> Mapping[str, Any]:
-        """Return a mapping inside a message, empty where it is not given."""
-        found = data.get(key)
-        if found is not None and not isinstance(found, Mapping):
-            raise self.fail(inside(where, key), found, "expected a mapping of keys to values")
-        return found or {}
-
-    def entries(self, data: Mapping[str, Any], key: str, where: str = "") -> list[Any]:
-        """Return a list inside a message, empty where it is not given."""
-        found = data.get(key)
-        if found is not None and not isinstance(found, list):
-            raise self.fail(inside(where, key), found, "expected a list")
-        return found or []
-
-    def messages(self, data: Mapping[str, Any], key: str, where: str = "") -> list[Mapping[str, Any]]:
-        """Return a list of messages inside a message, empty where it is not given."""
-        found = self.entries(data, key, where)
-        for k, item in enumerate(found):
-            if not isinstance(item, Mapping):
-                raise self.fail(f"{inside(where, key)}.{k}", item, "expected a mapping of keys to values")
-        return found
-
-    def number(self, value: Any, where: str) -> float:
-        """Return a finite number."""
-        if not is_number(value) or not np.isfinite(value):
-            raise self.fail(where, value, "expected a finite number")
-        return float(value)
-
-    def flag(self, value: Any, where: str) -> bool:
-        """Return a truth value, which a text such as ``"false"`` is not."""
-        if not isinstance(value, bool):
-            raise self.fail(where, value, "expected true or false")
-        return value
-
-    def numbers(self, data: Any, keys: str, default: Sequence[float], where: str) -> Array:
-        """Return an array of finite numbers, given as a list or by their keys.
-
-        Args:
-            data: The message.
-            keys: Their keys, one letter each.
-            default: Values of those that are not given.
-            where: Place of the message in the file.
-
-        Raises:
-            FileFormatError: It holds something else.
-        """
-        if data is None:
-            return np.array(default)
-        values = [data.get(k, d) for k, d in zip(keys, default, strict=True)] if isinstance(data, Mapping) else data
-        numbers = isinstance(values, list) and len(values) == len(keys) and all(map(is_number, values))
-        if not numbers or not np.isfinite(values).all():
-            raise self.fail(where, data, f"expected {len(keys)} finite numbers")
-        return np.array(values, float)
-
-
-def inside(where: str, key: str) -> str:
-    """Return the dotted path of a key inside a part of a file."""
-    return f"{where}.{key}" if where else key
 
 
 Pair = tuple[str, str]
@@ -202,143 +126,6 @@ class Conversion:
     notes: list[str] = field(default_factory=list)
 
 
-@dataclass
-class _Reader(MessageReader):
-    robot: Robot
-    joint_map: Mapping[str, str]
-    frame_map: Mapping[str, str]
-    notes: list[str] = field(default_factory=list)
-
-    def joint(self, name: str, where: str) -> str | None:
-        """Return the name of a planned joint of this robot, or None if the robot does not plan the joint."""
-        mapped = self.joint_map.get(name, name)
-        if mapped in self.robot.joint_names:
-            return mapped
-        if name in self.joint_map:
-            raise UnknownNameError(f"joint in the map of {name!r}", mapped, self.robot.joint_names)
-        note = f"{where}: joint {name!r} is not planned by {self.robot.name}"
-        if note not in self.notes:
-            self.notes.append(note)
-        return None
-
-    def frame(self, name: str, start: Array, where: str) -> Array:
-        """Return the pose of a frame in the world at the start state, shape (4, 4)."""
-        name = self.frame_map.get(name, name).lstrip("/")
-        if name in WORLD_FRAMES:
-            return np.eye(4)
-        if name in self.robot.link_names:
-            return self.robot.link_pose(start, name)
-        expected = f"expected the frame world or a link of {self.robot.name}; map it with --frame {name}=LINK"
-        raise self.fail(f"{where}.header.frame_id", name, expected)
-
-    def pose(self, data: Any, where: str) -> Array:
-        """Return a pose message as a matrix, shape (4, 4) [m]; the identity when the message is empty."""
-        if not data:
-            return np.eye(4)
-        if not isinstance(data, Mapping):
-            raise self.fail(where, data, "expected a mapping of keys to values")
-        position = self.numbers(data.get("position"), "xyz", (0.0, 0.0, 0.0), f"{where}.position")
-        turn = self.numbers(data.get("orientation"), "xyzw", (0.0, 0.0, 0.0, 1.0), f"{where}.orientation")
-        if not float(np.linalg.norm(turn)) > 1e-6:
-            turn = np.array([0.0, 0.0, 0.0, 1.0])  # an empty message means no rotation
-        return pose_matrix(position, turn)
-
-    def state(self, data: Mapping[str, Any], where: str) -> dict[str, float]:
-        """Return the planned joints of a robot state message."""
-        joints, at = self.section(data, "joint_state", where), f"{where}.joint_state"
-        names, positions = self.entries(joints, "name", at), self.entries(joints, "position", at)
-        if len(names) != len(positions):
-            raise self.fail(at, len(positions), f"expected {len(names)} positions")
-        if self.section(data, "multi_dof_joint_state", where).get("joint_names"):
-            self.notes.append(f"{where}.multi_dof_joint_state: the robot's base does not move")
-        found = {}
-        for k, (name, position) in enumerate(zip(names, positions, strict=True)):
-            ours = self.joint(str(name), at)
-            if ours is not None:
-                found[ours] = self.number(position, f"{at}.position.{k}")
-        return found
-
-    def shapes(self, item: Mapping[str, Any], where: str) -> Iterator[tuple[dict[str, Any], Array]]:
-        """Yield (shape fields, pose in the object's frame) of an object message."""
-        for k, (primitive, pose) in enumerate(self.paired(item, "primitives", "primitive_poses", where)):
-            yield self.primitive(primitive, f"{where}.primitives.{k}"), pose
-        for k, (mesh, pose) in enumerate(self.paired(item, "meshes", "mesh_poses", where)):
-            yield self.mesh(mesh, f"{where}.meshes.{k}"), pose
-        for k, (plane, pose) in enumerate(self.paired(item, "planes", "plane_poses", where)):
-            a, b, c, d = self.numbers(plane.get("coef"), "abcd", (0, 0, 1, 0), f"{where}.planes.{k}.coef")
-            self.notes.append(f"{where}.planes.{k}: read as the half-space below the plane")
-            yield {"half_space": {"normal": (a, b, c), "offset": -d}}, pose
-
-    def paired(self, item: Mapping[str, Any], shapes: str, poses: str, where: str) -> list[tuple[Any, Array]]:
-        found, placed = self.messages(item, shapes, where), self.entries(item, poses, where)
-        if placed and len(placed) != len(found):
-            raise self.fail(f"{where}.{poses}", len(placed), f"expected {len(found)} poses, one per shape")
-        placed = placed or [None] * len(found)
-        return [(s, self.pose(p, f"{where}.{poses}.{k}")) for k, (s, p) in enumerate(zip(found, placed, strict=True))]
-
-    def primitive(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
-        kind = data.get("type")
-        kind = PRIMITIVES.get(kind, kind) if isinstance(kind, int) else str(kind).lower()
-        size = self.entries(data, "dimensions", where)
-        counts = {"box": 3, "sphere": 1, "cylinder": 2}
-        if kind not in counts:
-            raise self.fail(f"{where}.type", data.get("type"), "cannot be read, expected box, sphere or cylinder")
-        if len(size) != counts[kind]:
-            raise self.fail(f"{where}.dimensions", size, f"expected {counts[kind]} numbers for a {kind}")
-        values = [self.number(v, f"{where}.dimensions.{k}") for k, v in enumerate(size)]
-        if kind == "box":
-            return {"box": tuple(values)}
-        if kind == "sphere":
-            return {"sphere": {"radius": values[0]}}
-        return {"cylinder": {"radius": values[1], "length": values[0]}}
-
-    def constrained_link(self, message: Mapping[str, Any], start: Array, where: str) -> tuple[str, Array]:
-        """Return the link of a constraint, and the pose of the frame that it is given in, shape (4, 4)."""
-        given = str(message.get("link_name"))
-        link = self.frame_map.get(given, given).lstrip("/")
-        if link not in self.robot.link_names:
-            expected = f"expected a link of {self.robot.name}; map it with --frame {given}=LINK"
-            raise self.fail(f"{where}.link_name", given, expected)
-        name = str(self.section(message, "header", where).get("frame_id", ""))
-        base = self.frame_map.get(name, name).lstrip("/")
-        if base in self.robot.link_names:
-            model = self.robot.model
-            if model.frames[self.robot.link_frame(base)].parentJoint != 0:
-                raise self.fail(f"{where}.header.frame_id", name, "cannot be read, expected a frame that does not move")
-        return link, self.frame(name, start, where)
-
-    def refuse(self, data: Mapping[str, Any], key: str, value: object, expected: str, where: str = "") -> None:
-        """Raise a FileFormatError where a part of a message is there and not empty."""
-        found = data.get(key)
-        if any(found.values()) if isinstance(found, Mapping) else found:
-            raise self.fail(inside(where, key), value, expected)
-
-    def record(self, kind: type[RecordT], fields: dict[str, Any], where: str) -> RecordT:
-        """Return an obstacle, a held object or a constraint."""
-        try:
-            return validate(kind, fields, str(self.file))
-        except FileFormatError as error:
-            raise self.fail(
-                inside(where, error.field) if error.field else where, error.value, error.expected
-            ) from error
-
-    def operation(self, item: Mapping[str, Any], known: tuple[int, ...], where: str) -> int:
-        """Return what is done with an object, out of the known operations."""
-        found = item.get("operation", ADD)
-        if not is_integer(found) or found not in known:
-            also = f", or {REMOVE} to remove it" if REMOVE in known else ""
-            raise self.fail(f"{where}.operation", found, f"expected {ADD} to add an object{also}")
-        return int(found)
-
-    def mesh(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
-        resource = data.get("resource")
-        if not resource:
-            raise self.fail(where, sorted(data), "cannot be read, expected a mesh by path (resource)")
-        scale = self.numbers(data.get("dimensions") or data.get("scale"), "xyz", (1.0, 1.0, 1.0), f"{where}.scale")
-        file = resolve(str(resource), self.file.resolve().parent, f"mesh {where}")
-        return {"mesh": {"file": str(file), "scale": tuple(scale.tolist())}}
-
-
 def convert(
     scene: Path,
     request: Path,
@@ -360,10 +147,39 @@ def convert(
         FileFormatError: Content is faulty or not supported; the message names it.
         UnknownNameError: The joint map names an unknown joint.
     """
-    scene_data, request_data = read_yaml(scene, "scene file"), read_yaml(request, "request file")
+    messages = read_yaml(scene, "scene file"), read_yaml(request, "request file")
+    return converted(*messages, robot, joint_map, frame_map, scene=scene, request=request)
+
+
+def converted(
+    scene_data: Mapping[str, Any],
+    request_data: Mapping[str, Any],
+    robot: Robot,
+    joint_map: Mapping[str, str] | None = None,
+    frame_map: Mapping[str, str] | None = None,
+    *,
+    scene: Path = Path("scene"),
+    request: Path = Path("request"),
+) -> Conversion:
+    """Return the problem of messages as plain data (:func:`convert`).
+
+    Args:
+        scene_data: A ``moveit_msgs/PlanningScene`` or its world.
+        request_data: A ``moveit_msgs/MotionPlanRequest``.
+        robot: The robot.
+        joint_map: Joint name in the messages -> planned joint of ``robot``.
+        frame_map: Frame in the messages -> ``world`` or a link of ``robot``.
+        scene: What the scene is called in errors, and where meshes are looked for.
+        request: What the request is called in errors.
+
+    Raises:
+        MissingFileError: A mesh cannot be read.
+        FileFormatError: Content is faulty or not supported; the message names it.
+        UnknownNameError: The joint map names an unknown joint.
+    """
     notes: list[str] = []
-    at_scene = _Reader(scene, robot, joint_map or {}, frame_map or {}, notes)
-    at_request = _Reader(request, robot, joint_map or {}, frame_map or {}, notes)
+    at_scene = RobotMessageReader(scene, robot, joint_map or {}, frame_map or {}, notes)
+    at_request = RobotMessageReader(request, robot, joint_map or {}, frame_map or {}, notes)
     scene_state = at_scene.section(scene_data, "robot_state")
     start_state = at_request.section(request_data, "start_state")
     start = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
@@ -386,7 +202,7 @@ def convert(
         if any(item.get(key.removeprefix("link_"), usual) != usual for item in at_scene.messages(scene_data, key)):
             notes.append(f"{key}: not used, the robot has its own size")
     constraints = tuple(_path_constraints(at_request, request_data, q))
-    goals = _goals(at_request, request_data, start)
+    goal = _goal(at_request, request_data, start)
     for key in HARMLESS:
         if request_data.get(key):
             notes.append(f"{key}: not used")
@@ -394,13 +210,13 @@ def convert(
     fields = {
         "name": name, "robot": robot.name, "scene": tuple(obstacles), "attached": tuple(attached),
         "allowed": tuple(allowed), "start": start,
-        "goal": Goal(joints=tuple(goals)), "constraints": constraints,
+        "goal": goal, "constraints": constraints,
     }  # fmt: skip
     problem = validate(Problem, fields, str(scene))
     return Conversion(problem, notes)
 
 
-def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[Obstacle]:
+def _obstacles(reader: RobotMessageReader, data: Mapping[str, Any], start: Array) -> list[Obstacle]:
     world = reader.section(data, "world") if "world" in data else data
     octomap = reader.section(reader.section(world, "octomap", "world"), "octomap", "world.octomap")
     if octomap.get("data"):
@@ -422,7 +238,9 @@ def _obstacles(reader: _Reader, data: Mapping[str, Any], start: Array) -> list[O
     return [body for bodies in found.values() for body in bodies]
 
 
-def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Array) -> Iterator[AttachedObject]:
+def _attached(
+    reader: RobotMessageReader, state: Mapping[str, Any], where: str, start: Array
+) -> Iterator[AttachedObject]:
     for k, entry in enumerate(reader.messages(state, "attached_collision_objects", where)):
         here = f"{where}.attached_collision_objects.{k}"
         link = reader.frame_map.get(str(entry.get("link_name")), str(entry.get("link_name")))
@@ -444,7 +262,7 @@ def _attached(reader: _Reader, state: Mapping[str, Any], where: str, start: Arra
             yield reader.record(AttachedObject, fields, here)
 
 
-def _bodies(reader: _Reader, item: Mapping[str, Any], where: str) -> list[tuple[str, dict[str, Any], Array]]:
+def _bodies(reader: RobotMessageReader, item: Mapping[str, Any], where: str) -> list[tuple[str, dict[str, Any], Array]]:
     """Return (name, shape fields, pose in the object's header frame) of every shape of an object."""
     label = re.sub(r"[^A-Za-z0-9_.-]+", "_", str(item.get("id", "")).strip()).strip("_.-")
     label = label or where.replace(".", "_")
@@ -456,7 +274,7 @@ def _bodies(reader: _Reader, item: Mapping[str, Any], where: str) -> list[tuple[
     return [(name, shape, own @ pose) for name, (shape, pose) in zip(names, shapes, strict=True)]
 
 
-def _path_constraints(reader: _Reader, data: Mapping[str, Any], start: Array) -> Iterator[Constraint]:
+def _path_constraints(reader: RobotMessageReader, data: Mapping[str, Any], start: Array) -> Iterator[Constraint]:
     """Yield the constraints of ``path_constraints``, which imply those of the message."""
     reader.refuse(data, "trajectory_constraints", "constraints of a trajectory", "cannot be read, expected none")
     where = "path_constraints"
@@ -470,7 +288,7 @@ def _path_constraints(reader: _Reader, data: Mapping[str, Any], start: Array) ->
         yield _position_constraint(reader, position, start, f"{where}.position_constraints.{k}")
 
 
-def _check_joint_constraint(reader: _Reader, message: Mapping[str, Any], where: str) -> None:
+def _check_joint_constraint(reader: RobotMessageReader, message: Mapping[str, Any], where: str) -> None:
     """Raise a FileFormatError unless a joint's limits imply its constraint."""
     joint = reader.joint(str(message.get("joint_name")), where)
     if joint is None:
@@ -488,7 +306,7 @@ def _check_joint_constraint(reader: _Reader, message: Mapping[str, Any], where: 
 
 
 def _orientation_constraint(
-    reader: _Reader, message: Mapping[str, Any], start: Array, where: str
+    reader: RobotMessageReader, message: Mapping[str, Any], start: Array, where: str
 ) -> Iterator[Constraint]:
     """Yield a constraint of the orientation, or of one axis where turns about it are free.
 
@@ -522,8 +340,20 @@ def _orientation_constraint(
         yield reader.record(ToolRegion, {"frame": link, "angle": angle, **orientation}, where)
 
 
-def _position_constraint(reader: _Reader, message: Mapping[str, Any], start: Array, where: str) -> ToolRegion:
+def _position_constraint(
+    reader: RobotMessageReader, message: Mapping[str, Any], start: Array, where: str
+) -> ToolRegion:
     """Return the box that a link's origin, or the grasp point of a hand, stays in."""
+    frame, shape, pose = _region(reader, message, start, where, "box")
+    half = np.array(shape["box"]) / 2.0
+    fields = {"lower": tuple((-half).tolist()), "upper": tuple(half.tolist()), **pose_fields(pose)}
+    return reader.record(ToolRegion, {"frame": frame, **fields}, f"{where}.constraint_region")
+
+
+def _region(
+    reader: RobotMessageReader, message: Mapping[str, Any], start: Array, where: str, kind: str
+) -> tuple[str, dict[str, Any], Array]:
+    """Return the frame of a position constraint, a link or a hand, the one shape that it is in, and that one's pose."""
     link, base = reader.constrained_link(message, start, where)
     offset = reader.numbers(message.get("target_point_offset"), "xyz", (0.0, 0.0, 0.0), f"{where}.target_point_offset")
     if float(np.linalg.norm(offset)) > SAME_POINT:
@@ -533,27 +363,65 @@ def _position_constraint(reader: _Reader, message: Mapping[str, Any], start: Arr
             expected = "cannot be read, expected 0, or the grasp point of a hand"
             raise reader.fail(f"{where}.target_point_offset", offset.tolist(), expected)
         link = near[0]
-    inside_of = f"{where}.constraint_region"
+    inside_of, expected = f"{where}.constraint_region", f"cannot be read, expected one {kind}"
     region = reader.section(message, "constraint_region", where)
-    reader.refuse(region, "meshes", "a list", "cannot be read, expected one box", inside_of)
+    reader.refuse(region, "meshes", "a list", expected, inside_of)
     shapes = reader.paired(region, "primitives", "primitive_poses", inside_of)
     if len(shapes) != 1:
-        raise reader.fail(f"{inside_of}.primitives", len(shapes), "cannot be read, expected one box")
+        raise reader.fail(f"{inside_of}.primitives", len(shapes), expected)
     shape = reader.primitive(shapes[0][0], f"{inside_of}.primitives.0")
-    if "box" not in shape:
-        raise reader.fail(f"{inside_of}.primitives.0", next(iter(shape)), "cannot be read, expected one box")
-    half = np.array(shape["box"]) / 2.0
-    fields = {"lower": tuple((-half).tolist()), "upper": tuple(half.tolist()), **pose_fields(base @ shapes[0][1])}
-    return reader.record(ToolRegion, {"frame": link, **fields}, inside_of)
+    if kind not in shape:
+        raise reader.fail(f"{inside_of}.primitives.0", next(iter(shape)), expected)
+    return link, shape, base @ shapes[0][1]
 
 
-def _goals(reader: _Reader, data: Mapping[str, Any], start: Mapping[str, float]) -> list[dict[str, float]]:
+def _goal(reader: RobotMessageReader, data: Mapping[str, Any], start: Mapping[str, float]) -> Goal:
+    """Return the goal: poses of one or more links, as MoveIt makes them of poses, or joints."""
+    goals = reader.messages(data, "goal_constraints")
+    if len(goals) == 1 and goals[0].get("position_constraints") and not goals[0].get("joint_constraints"):
+        return Goal(poses=tuple(_pose_targets(reader, goals[0], start, "goal_constraints.0")))
+    return Goal(joints=tuple(_joint_goals(reader, goals, start)))
+
+
+def _pose_targets(
+    reader: RobotMessageReader, goal: Mapping[str, Any], start: Mapping[str, float], where: str
+) -> Iterator[PoseTarget]:
+    """Yield a pose for each position constraint, which is a ball; its center and its radius, as a tolerance, count.
+
+    An orientation constraint of the same link gives the orientation, with the smallest of its tolerances.
+    """
+    reader.refuse(goal, "visibility_constraints", "a list", "cannot be read, expected none", where)
+    q = np.array([start[name] for name in reader.robot.joint_names])
+    turns = {str(one.get("link_name")): one for one in reader.messages(goal, "orientation_constraints", where)}
+    for k, message in enumerate(reader.messages(goal, "position_constraints", where)):
+        at = f"{where}.position_constraints.{k}"
+        frame, shape, pose = _region(reader, message, q, at, "sphere")
+        tolerance = {"position": shape["sphere"]["radius"]}
+        fields: dict[str, Any] = {"frame": frame, "position": pose_fields(pose)["position"], "tolerance": tolerance}
+        turn = turns.pop(str(message.get("link_name")), None)
+        if turn is not None:
+            there = f"{where}.orientation_constraints of {message.get('link_name')}"
+            _, base = reader.constrained_link(turn, q, there)
+            fields["orientation"] = pose_fields(base @ reader.pose({"orientation": turn.get("orientation")}, there))[
+                "orientation"
+            ]
+            angles = [reader.number(turn.get(f"absolute_{axis}_axis_tolerance", 0.0), there) for axis in "xyz"]
+            tolerance["angle"] = min(angles)
+        yield reader.record(PoseTarget, fields, at)
+    if turns:
+        raise reader.fail(where, next(iter(turns)), "expected a position for each link with an orientation")
+
+
+def _joint_goals(
+    reader: RobotMessageReader, found: Sequence[Mapping[str, Any]], start: Mapping[str, float]
+) -> list[dict[str, float]]:
     goals = []
-    for k, goal in enumerate(reader.messages(data, "goal_constraints")):
+    for k, goal in enumerate(found):
         where = f"goal_constraints.{k}"
         for other in ("position_constraints", "orientation_constraints", "visibility_constraints"):
             if goal.get(other):
-                raise reader.fail(f"{where}.{other}", "a list", "cannot be read, expected joint_constraints only")
+                expected = "cannot be read, expected joint_constraints only, or one goal of positions"
+                raise reader.fail(f"{where}.{other}", "a list", expected)
         values = dict(start)
         reached = False
         for j, constraint in enumerate(reader.messages(goal, "joint_constraints", where)):

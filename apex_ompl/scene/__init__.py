@@ -20,9 +20,17 @@ if TYPE_CHECKING:
     from apex_ompl.scene.points import points_from_depth as points_from_depth
     from apex_ompl.scene.problem import Alignment as Alignment
     from apex_ompl.scene.problem import Goal as Goal
+    from apex_ompl.scene.problem import MoveStep as MoveStep
     from apex_ompl.scene.problem import PoseTarget as PoseTarget
     from apex_ompl.scene.problem import Problem as Problem
     from apex_ompl.scene.problem import Tolerance as Tolerance
+    from apex_ompl.scene.steps import GraspStep as GraspStep
+    from apex_ompl.scene.steps import HandStep as HandStep
+    from apex_ompl.scene.steps import LineStep as LineStep
+    from apex_ompl.scene.steps import ReleaseStep as ReleaseStep
+    from apex_ompl.scene.steps import RetreatStep as RetreatStep
+    from apex_ompl.scene.steps import TurnStep as TurnStep
+    from apex_ompl.scene.steps import WaitStep as WaitStep
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
@@ -30,6 +38,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "bodies": "AttachedObject Obstacle",
         "constraints": "FixedOrientation OnLine OnPlane Pose PoseTolerance RelativePose ToolRegion Upright",
         "points": "points_from_depth",
-        "problem": "Alignment Goal PoseTarget Problem Tolerance",
+        "problem": "Alignment Goal MoveStep PoseTarget Problem Tolerance",
+        "steps": "GraspStep HandStep LineStep ReleaseStep RetreatStep TurnStep WaitStep",
     },
 )

@@ -18,6 +18,16 @@ from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_v
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
+from apex_ompl.scene.steps import (
+    GraspStep,
+    HandStep,
+    LineStep,
+    ReleaseStep,
+    RetreatStep,
+    Step,
+    TurnStep,
+    WaitStep,
+)
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
@@ -146,6 +156,34 @@ class Goal(StrictModel):
         return self
 
 
+class MoveStep(Step):
+    """A motion to a further goal, by the planner.
+
+    Attributes:
+        goal: The goal; joints that one by joint names leaves out stay.
+    """
+
+    kind: Literal["move"] = "move"
+    goal: Goal
+
+    @property
+    def subject(self) -> str:
+        """What is moved, or the kind of goal."""
+        if self.goal.poses is not None:
+            return " and ".join(pose.frame for pose in self.goal.poses)
+        if self.goal.alignment is None:
+            return "joints"
+        sides = self.goal.alignment.first, self.goal.alignment.second
+        return " and ".join(one.link if isinstance(one, WorldVector) else one for one in sides)
+
+
+AnyStep = Annotated[
+    MoveStep | LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep,
+    Field(discriminator="kind"),
+]
+"""A step after the goal in a problem file."""
+
+
 class Problem(StrictModel):
     """A motion planning problem.
 
@@ -159,7 +197,8 @@ class Problem(StrictModel):
         allowed: Pairs of bodies that may touch and overlap: names of links, held objects, obstacles and fixtures.
         start: Joint name -> value of the start state.
         goal: The goal.
-        constraints: What holds along the whole path.
+        constraints: What holds along the whole path to the goal.
+        after: Steps after the goal, which :func:`apex_ompl.plan_task` plans too.
     """
 
     schema_id: Literal["apex-ompl/problem/1"] = Field(default="apex-ompl/problem/1", alias="schema")
@@ -172,8 +211,9 @@ class Problem(StrictModel):
     start: JointValues
     goal: Goal
     constraints: tuple[AnyConstraint, ...] = ()
+    after: tuple[AnyStep, ...] = ()
 
-    @field_validator("scene", "attached", "allowed", "constraints", mode="before")
+    @field_validator("scene", "attached", "allowed", "constraints", "after", mode="before")
     @classmethod
     def _nothing_is_empty(cls, value: Any) -> Any:
         return () if value is None else value

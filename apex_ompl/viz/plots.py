@@ -24,7 +24,7 @@ from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.files import suffix_of, write_atomically
 from apex_ompl.viz.appearance import CLEARANCE_COLORS, EVENT_COLORS, PATH_COLORS, SILENT_EVENTS
-from apex_ompl.viz.sources import ORDERS, clearances, robot_of, shares_of_limits
+from apex_ompl.viz.sources import ORDERS, clearances_of, robot_of, shares_of_limits
 
 FORMATS = (".png", ".pdf", ".svg")
 TIME_STEP, MAX_SAMPLES = 0.002, 4000  # of a curve [s]
@@ -89,9 +89,8 @@ def plot_motion(result: PlanResult, out: str | os.PathLike[str]) -> None:
         axis.set_xlabel(f"time s; {len(motion.times)} knots" if column == 0 else "time s")
     clearance_times = np.linspace(0.0, motion.duration, CLEARANCE_SAMPLES)
     axis = figure.add_subplot(grid[len(ORDERS), :])
-    dynamic = [o for o in result.problem.scene if o.name in result.dynamic_obstacles]
     axis.set_xlim(*ends)
-    axis.plot(clearance_times, 1e3 * clearances(checker, motion, clearance_times, dynamic), color=CLEARANCE_COLORS[0])
+    axis.plot(clearance_times, 1e3 * clearances_of(result, checker, clearance_times), color=CLEARANCE_COLORS[0])
     axis.set_ylim(bottom=0.0)
     axis.grid(alpha=0.25)
     axis.set_ylabel("clearance mm", fontsize=9)

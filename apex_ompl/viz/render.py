@@ -16,6 +16,7 @@ from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.loop.result import RunResult
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.path import resample
+from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
@@ -26,6 +27,7 @@ from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.viz.appearance import (
     BACKGROUND,
     EDGE,
+    HELD,
     OBSTACLES,
     SILENT_EVENTS,
     Item,
@@ -65,6 +67,7 @@ class SceneRenderer:
         self._plotter.set_background(BACKGROUND)
         items = items_of(setup)
         self._moving = [item for item in items if item.moves]
+        self._objects: dict[str, Array | None] = {}  # poses in the world of held objects that are shown elsewhere
         self._actors = [self._add(item, np.eye(4)) for item in self._moving]
         self._obstacles: dict[str, tuple[Array, list[Any]]] = {}  # where they were placed, and their actors
         for item in items:
@@ -115,14 +118,26 @@ class SceneRenderer:
             if pose is not None:
                 actor.user_matrix = pose @ np.linalg.inv(placed)
 
-    def _poses(self, q: Array) -> list[Array]:
-        joints = joint_poses(self.robot, self._data, q)
-        return [joints[item.joint] @ item.placement for item in self._moving]
+    def show_object(self, name: str, pose: Array | None) -> None:
+        """Show an object that is held at some time at a pose in the world, shape (4, 4), or hide it."""
+        if any(held.name == name for held in self._setup.problem.attached):
+            self._objects[name] = pose
+        else:
+            self.show_obstacle(name, pose)
+
+    def _poses(self, q: Array) -> list[Array | None]:
+        joints, found = joint_poses(self.robot, self._data, q), list[Array | None]()
+        for item in self._moving:
+            moved = item.layer == HELD and item.name in self._objects
+            found.append(self._objects[item.name] if moved else joints[item.joint] @ item.placement)
+        return found
 
     def screenshot(self, q: Array, caption: str = "") -> NDArray[np.uint8]:
         """Return an image of the scene with the robot at a state, shape (height, width, 3), and a line of text."""
         for actor, pose in zip(self._actors, self._poses(q), strict=True):
-            actor.user_matrix = pose
+            actor.visibility = pose is not None
+            if pose is not None:
+                actor.user_matrix = pose
         if caption:
             size = max(6, self._plotter.window_size[1] // 45)
             self._plotter.add_text(
@@ -207,7 +222,7 @@ def _strip(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float
     """Return a .png of states along the path, or of moments among dynamic obstacles, in reading order."""
     renderer, motion = _renderer(source, (size[0] // 2, size[1] // 2), azimuth), source.trajectory
     columns, rows = STRIP
-    if motion is not None and (_dynamic(source) or isinstance(source, RunResult)):
+    if motion is not None and (_dynamic(source) or isinstance(source, RunResult | TaskResult)):
         times = np.linspace(0.0, motion.duration, columns * rows)
         frames = [_moment(renderer, source, motion, float(t)) for t in times]
     else:
@@ -239,6 +254,9 @@ def _moment(
     for obstacle in _dynamic(source):
         pose = obstacle_at(obstacle, time).pose if is_there(obstacle, time) else None
         renderer.show_obstacle(obstacle.name, pose)
+    if isinstance(source, TaskResult):
+        for name, pose in source.object_poses(renderer.robot, time).items():
+            renderer.show_object(name, pose)
     return renderer.screenshot(motion(time), caption(source, time) if isinstance(source, RunResult) else "")
 
 

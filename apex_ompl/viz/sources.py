@@ -12,6 +12,7 @@ import numpy as np
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import ARCHIVE, RunResult
+from apex_ompl.planning.task_result import TaskResult, load_result
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import load_same_robot
@@ -57,7 +58,7 @@ def load_saved(path: Path) -> Saved:
         FileFormatError: It holds neither.
         ParameterError: It has another suffix.
     """
-    return (saved_kind(path) or PlanResult).load(path)
+    return RunResult.load(path) if saved_kind(path) is RunResult else load_result(path)
 
 
 def robot_of(saved: Saved) -> Robot:
@@ -121,6 +122,29 @@ def clearances(checker: CollisionChecker, motion: Trajectory, times: Array, dyna
         for one in here:
             among[names].move(one.name, one.position)
         found.append(among[names].clearance(q))
+    return np.array(found)
+
+
+def clearances_of(result: PlanResult, checker: CollisionChecker, times: Array) -> Array:
+    """Return the clearance of the motion of a result at some times, shape (N,) [m]; of a task with what it holds then.
+
+    Args:
+        result: A result with a timed motion.
+        checker: The robot in the scene of its problem.
+        times: Shape (N,) [s].
+    """
+    motion = result.trajectory
+    assert motion is not None
+    if not isinstance(result, TaskResult):
+        dynamic = [one for one in result.problem.scene if one.name in result.dynamic_obstacles]
+        return clearances(checker, motion, times, dynamic)
+    steps, made = [result.step_at(time) for time in times.tolist()], dict[str, CollisionChecker]()
+    found = []
+    for step, q in zip(steps, motion(times), strict=True):
+        key = f"{step.start}"
+        if key not in made:
+            made[key] = CollisionChecker(checker.robot, step.scene, step.attached, step.allowed)
+        found.append(made[key].clearance(q))
     return np.array(found)
 
 

@@ -31,21 +31,27 @@ class StandIns:
         processes: Their processes.
     """
 
-    def __init__(self, robot: Robot, folder: Path) -> None:
-        """Start them; each writes what it does to a file in a folder."""
+    def __init__(self, robot: Robot, folder: Path, arguments: Sequence[str] = ()) -> None:
+        """Start them with arguments of ROS; each writes what it does to a file in a folder."""
         left = [name for name in robot.joint_names if name.startswith("left")]
         self.joints = {"left": left, "right": [name for name in robot.joint_names if name not in left]}
         self.robot, self.folder, self.processes = robot, folder, list[subprocess.Popen[bytes]]()
         home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
         for name, joints in self.joints.items():
             at = [f"{PREFIX}{joint}={home[joint]!r}" for joint in joints]
-            command = [sys.executable, "-m", PROGRAM, str(folder / name), name, *at]
+            command = [sys.executable, "-m", PROGRAM, str(folder / name), name, *at, "--ros-args", *arguments]
             self.processes.append(subprocess.Popen(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}))
 
     def driver(self, **options: Any) -> Ros2Driver:
         """Return a driver that sends them motions."""
         renamed = {name: PREFIX + name for name in self.robot.joint_names}
         return Ros2Driver(self.robot, self.joints, renamed=renamed, **{"started": 60.0, "silence": 10.0} | options)
+
+    def parameters(self) -> list[str]:
+        """Return the arguments by which the node ``apex-ompl ros2`` knows them."""
+        controllers = [f"{name}={','.join(joints)}" for name, joints in self.joints.items()]
+        renamed = [f"{name}={PREFIX}{name}" for name in self.robot.joint_names]
+        return ["-p", f"controllers:={controllers}", "-p", f"renamed:={renamed}"]
 
     def close(self) -> None:
         """End them."""

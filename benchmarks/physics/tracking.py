@@ -18,7 +18,7 @@ import numpy as np
 from tqdm import tqdm
 
 from apex_ompl import plan, problems
-from apex_ompl.drivers import MujocoDriver
+from apex_ompl.drivers import Guard, MujocoDriver
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.drivers.twin import with_mass
 from apex_ompl.problems.suite_robot import robot
@@ -87,7 +87,7 @@ HEAD = (
 def follow(figures: Figures, case: Case, problem: Problem, motion: Trajectory) -> None:
     """Follow a motion and add its figures."""
     assumed = None if case.known else Case(case.limited, 0.0).loaded(problem)
-    driver = MujocoDriver(robot(), case.loaded(problem), assumed=assumed)
+    driver = MujocoDriver(robot(), case.loaded(problem), assumed=assumed, guard=Guard(tracking=None))
     if not case.known:
         driver.advance(1.0)  # the arms come to rest under the load
     driver.forget()

@@ -15,7 +15,8 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError, SceneError, UnknownNameError
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.robot import Robot
-from apex_ompl.robot.moveit import MessageReader, allowed_pairs
+from apex_ompl.robot.moveit import allowed_pairs
+from apex_ompl.robot.moveit_messages import MessageReader
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 
 

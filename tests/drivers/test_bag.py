@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from bags import read
 from support import benchmark_script
 
 from apex_ompl.drivers import BagDriver
@@ -18,18 +18,6 @@ pytest.importorskip("rosbags")
 
 ZERO = 1_700_000_000.25
 CONTROLLERS = {"left_arm": slice(0, 7), "right_arm": slice(7, 14), "hands": slice(14, 16)}
-
-
-def read(folder: Path) -> dict[str, list[tuple[int, Any]]]:
-    """The messages of each topic, with the times in the bag [ns]."""
-    from rosbags.rosbag2 import Reader
-    from rosbags.typesys import Stores, get_typestore
-
-    types, found = get_typestore(Stores.ROS2_JAZZY), dict[str, list[tuple[int, Any]]]()
-    with Reader(folder) as reader:
-        for connection, time, data in reader.messages():
-            found.setdefault(connection.topic, []).append((time, types.deserialize_cdr(data, connection.msgtype)))
-    return found
 
 
 @pytest.fixture(scope="module")

@@ -30,6 +30,7 @@ def run(root: Path) -> list[str]:
     made: set[type] = set()
     with _traced(called, made):
         _use_planner()
+        _use_tasks()
         _use_records()
         _use_trajectories()
         _use_problems()
@@ -137,6 +138,20 @@ def _use_planner() -> None:
         planner.plan(home, home, timeout=-1.0)
     except apex_ompl.ApexError as error:
         assert "timeout" in str(error)
+
+
+def _use_tasks() -> None:
+    """Tasks: the steps after a goal."""
+    import apex_ompl
+
+    robot = apex_ompl.load_robot("dual_panda_softhand")
+    task = apex_ompl.plan_task("stack_boxes", timeout=20.0)
+    assert task and task.steps[-1].kind == "retreat" and task.step_at(0.0).kind == "goal"
+    assert task.object_poses(robot, task.goal_time)["upper"] is not None
+    task.save("task.npz")
+    assert apex_ompl.TaskResult.load("task.npz").as_dict() == task.as_dict()
+    with apex_ompl.MotionPlanner(robot) as planner:
+        assert planner.plan_task(apex_ompl.load_problem("handover"), timeout=20.0)
 
 
 def _use_records() -> None:
@@ -279,9 +294,9 @@ def _use_run() -> None:
 
 
 def _use_drivers() -> None:
-    """An exact robot, and one that writes a bag; docs/drivers.md uses that of physics."""
+    """Exact robots, one that writes a bag, and one by functions; docs/drivers.md uses that of physics."""
     import apex_ompl
-    from apex_ompl.drivers import BagDriver, KinematicDriver
+    from apex_ompl.drivers import BagDriver, CombinedDriver, FrankaSettings, FunctionDriver, Guard, KinematicDriver
 
     robot = apex_ompl.load_robot("panda")
     goal = robot.home + 0.2 * (np.arange(robot.dof) == 0)
@@ -294,3 +309,13 @@ def _use_drivers() -> None:
         assert not driver.state().velocities.any()
         driver.close()
     assert Path("bag/metadata.yaml").exists()
+    pushed = KinematicDriver(robot, guard=Guard(tracking=0.02), joints=robot.joint_names[:4])
+    pushed.push(np.full(4, 0.03))
+    assert pushed.fault and np.abs(pushed.recover() - robot.home[:4] - 0.03).max() < 1e-9
+    rest = FunctionDriver(robot, robot.joint_names[4:], lambda q: None, rate=500.0)
+    whole = CombinedDriver(robot, [rest, KinematicDriver(robot, clock=lambda: rest.time, joints=robot.joint_names[:4])])
+    whole.send(motion, whole.time + 0.05)
+    whole.stop()
+    assert not whole.fault
+    whole.close()
+    assert FrankaSettings(rate=500.0).lead == 0.02

@@ -148,6 +148,7 @@ def test_a_free_way_is_gone_at_once() -> None:
 @pytest.mark.parametrize(
     ("fault", "words"),
     [("jumps", "rad from where it should be"), ("silent", "no state of the robot was usable"),
+     ("unread", "no state of the robot was usable"),
      ("clock", "the clock went back by 0.39"), ("told", "the operator said so")],
 )  # fmt: skip
 def test_a_robot_with_a_fault_ends_at_rest_with_a_reason(fault: str, words: str) -> None:
@@ -167,6 +168,8 @@ def test_a_robot_with_a_fault_ends_at_rest_with_a_reason(fault: str, words: str)
                 q = q + 0.1 * (np.arange(len(q)) == 3)
             elif fault == "silent":
                 q = np.full(len(q), np.nan)
+            elif fault == "unread":
+                q = None
             elif fault == "clock":
                 time -= 0.4
             else:

@@ -138,6 +138,43 @@ def test_constraints_that_would_change_the_problem_are_errors(
         converted(tmp_path, robot, request=REQUEST.split("goal_constraints")[0])
 
 
+POSE_GOAL = """goal_constraints:
+  - position_constraints:
+      - header: {frame_id: base_link}
+        link_name: palm
+        constraint_region:
+          primitives: [{type: 2, dimensions: [0.002]}]
+          primitive_poses: [{position: {x: 0.5, y: 0.2, z: 0.6}, orientation: {w: 1.0}}]
+    orientation_constraints:
+      - header: {frame_id: base_link}
+        link_name: palm
+        orientation: {x: 1.0, y: 0.0, z: 0.0, w: 0.0}
+        absolute_x_axis_tolerance: 0.05
+        absolute_y_axis_tolerance: 0.03
+        absolute_z_axis_tolerance: 0.04
+"""
+
+
+def test_a_goal_of_positions_and_orientations_is_one_of_poses(robot: Robot, tmp_path: Path) -> None:
+    head = REQUEST.split("goal_constraints")[0]
+    goal = converted(tmp_path, robot, request=head + POSE_GOAL).problem.goal
+    assert goal.poses is not None
+    (pose,) = goal.poses
+    assert (pose.frame, pose.position) == ("left_hand_palm", (0.5, 0.2, 0.6))
+    np.testing.assert_allclose(np.abs(pose.orientation), (1.0, 0.0, 0.0, 0.0), atol=1e-12)
+    assert (pose.tolerance.position, pose.tolerance.angle) == (0.002, 0.03)
+    alone = POSE_GOAL.partition("    orientation_constraints")[0]
+    (free,) = converted(tmp_path, robot, request=head + alone).problem.goal.poses or ()
+    assert free.orientation is None
+    for change, word in (
+        (("type: 2, dimensions: [0.002]", "type: 1, dimensions: [1, 1, 1]"), "expected one sphere"),
+        (("link_name: palm\n        orientation", "link_name: left_link5\n        orientation"), "a position for each"),
+        (("link_name: palm", "link_name: nose"), "expected a link of"),
+    ):
+        with pytest.raises(FileFormatError, match=word):
+            converted(tmp_path, robot, request=head + POSE_GOAL.replace(*change))
+
+
 def test_the_command_converts_and_what_it_writes_plans(apex_cli, robot: Robot, tmp_path: Path) -> None:
     converted(tmp_path, robot)
     arguments = ["convert", tmp_path / "scene0001.yaml", tmp_path / "request0001.yaml", "-o", tmp_path / "p.yaml"]

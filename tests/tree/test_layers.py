@@ -2,7 +2,8 @@
 
 From the top, as CONTRIBUTING has it:
 
-1. `cli` parses commands; `evaluation` runs OMPL's Benchmark and reports; `viz` draws: renderings, plots, the viewer.
+1. `cli` parses commands; `evaluation` runs OMPL's Benchmark and reports; `viz` draws: renderings, plots, the viewer;
+   `ros2` is a node of ROS 2.
 2. `api`: `load_problem`, `setup`, `plan`, `run`; `loop`: environment, sensor, executor and clocks; `loop.replan`:
    replanners.
 3. `planning`: `MotionPlanner`, `World`, the steps of a plan; `result`: what a plan returns.
@@ -12,7 +13,7 @@ From the top, as CONTRIBUTING has it:
    generation.
 6. `apex`: the planner APEX, its parameters, the stages of `solve`, their context and report.
 7. `moving`: dynamic obstacles in time and what replanners share; `ompl`: state space, validity checkers, set-up for
-   OMPL; `drivers`: robots that follow motions.
+   OMPL; `drivers`: robots that follow motions; `perception`: cameras, and what they see.
 8. `goals`: alignments, poses, grasps, inverse kinematics; `timing`: motions over time; `model`: inference without
    torch.
 9. `constraints`: what holds along a path; `collision`: the checker, spheres before meshes; `paths`: splines, the
@@ -40,6 +41,7 @@ LAYERS = [
     {"constraints"},
     {"goals", "timing", "model"},
     {"drivers"},
+    {"perception"},
     {"ompl"},
     {"moving"},
     {"apex"},
@@ -51,7 +53,7 @@ LAYERS = [
     {"planning"},
     {"loop"},
     {"api"},
-    {"evaluation", "viz"},
+    {"evaluation", "ros2", "viz"},
     {"cli"},
 ]
 HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names}

@@ -23,6 +23,7 @@ from apex_ompl.viz.appearance import (
     CONTACT,
     COVER,
     EDGE,
+    HELD,
     OBSTACLES,
     PATH_COLORS,
     ROBOT,
@@ -120,6 +121,7 @@ class RobotNodes:
         for joint in sorted({j for k in (*joints, *(item.joint for item in items)) for j in self._chain(k)}):
             path = f"{self._paths[int(self._model.parents[joint])]}/joint {joint}"
             self._paths[joint], self._frames[joint] = path, api.add_frame(path, show_axes=False)
+        self._placed = dict[str, Array]()  # held objects that were put elsewhere, in the frames of their joints
         self.handles = [(item, add_item(api, self._paths[item.joint], item)) for item in items]
 
     def _chain(self, joint: int) -> Iterable[int]:
@@ -142,6 +144,24 @@ class RobotNodes:
             if known is None or np.abs(pose[:3, 3] - known[:3, 3]).max() > STILL:
                 frame.position = pose[:3, 3]
             self._sent[joint] = pose
+
+    def place(self, name: str, pose: Array | None) -> bool:
+        """Put a held object at a pose in the world, shape (4, 4), or hide it.
+
+        Returns:
+            Whether there is such an object.
+        """
+        found = [(item, handle) for item, handle in self.handles if item.layer == HELD and item.name == name]
+        for item, handle in found:
+            if handle.visible != (pose is not None):
+                handle.visible = pose is not None
+            if pose is None:
+                continue
+            inside = np.linalg.inv(np.array(self._data.oMi[item.joint].homogeneous)) @ pose
+            if np.abs(inside - self._placed.get(name, item.placement)).max() > STILL:
+                handle.wxyz, handle.position = turn_of(inside), inside[:3, 3]
+                self._placed[name] = inside
+        return bool(found)
 
 
 def plain(name: str) -> str:
@@ -309,6 +329,11 @@ class BrowserScene:
             handle.visible = pose is not None
         if handle is not None and pose is not None:
             self.move_obstacle(name, pose)
+
+    def show_object(self, name: str, pose: Array | None) -> None:
+        """Show an object that is held at some time at a pose in the world, shape (4, 4), or hide it."""
+        if not self.robot.place(name, pose):
+            self.show_obstacle(name, pose)
 
     def remove_obstacle(self, name: str) -> None:
         """Remove an obstacle if it is there."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.path import resample
+from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.model import load_same_robot
 from apex_ompl.scene.bodies import Obstacle
@@ -19,7 +20,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
-from apex_ompl.viz.sources import ORDERS, clearances, shares_of_limits
+from apex_ompl.viz.sources import ORDERS, clearances, clearances_of, shares_of_limits
 from apex_ompl.viz.viewer.scene import BrowserScene
 
 UNTIMED, STATES = 4.0, 120  # how long a path without times plays [s], and its states
@@ -93,6 +94,9 @@ class Shown:
         at = min(max(time, 0.0), self.duration)
         for obstacle in self._dynamic:
             scene.show_obstacle(obstacle.name, obstacle_at(obstacle, at).pose if is_there(obstacle, at) else None)
+        if isinstance(self.result, TaskResult) and self.result.trajectory is not None:
+            for name, pose in self.result.object_poses(self.setup.robot, at).items():
+                scene.show_object(name, pose)
 
     @cached_property
     def _dynamic(self) -> tuple[Obstacle, ...]:
@@ -108,7 +112,10 @@ class Shown:
         """Curves of a timed motion over ``time`` [s]: ``clearance`` [mm] and the use of limits, by name."""
         if self.result is None or self.result.trajectory is None:
             return {}
-        return self.curves_of(self.result.trajectory, self._dynamic)
+        found = self.curves_of(self.result.trajectory, self._dynamic)
+        if isinstance(self.result, TaskResult):
+            found["clearance"] = 1e3 * clearances_of(self.result, self.setup.checker, found["time"])
+        return found
 
     def curves_of(self, motion: Trajectory, dynamic: Sequence[Obstacle]) -> dict[str, Array]:
         """Return the curves of a motion among dynamic obstacles."""

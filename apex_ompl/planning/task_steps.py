@@ -1,0 +1,433 @@
+"""One step of a task after another: straight lines, hands that open and close, retreats and rests, each proved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from math import nan
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.shapes import coal_geometry, world_geometry
+from apex_ompl.constraints.frames import frame_of
+from apex_ompl.constraints.line import SAME_POINT
+from apex_ompl.errors import SceneError, TimingError
+from apex_ompl.goals.grasp import grasp
+from apex_ompl.ompl.validity import full_check
+from apex_ompl.paths.path import Path
+from apex_ompl.planning.line_query import line_query
+from apex_ompl.planning.lines import plan_along
+from apex_ompl.planning.task_world import TaskWorld
+from apex_ompl.robot import Robot
+from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
+from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep, WaitStep
+from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.trajectory import ROUNDING
+from apex_ompl.types import Array
+from apex_ompl.util.arrays import length
+from apex_ompl.util.clocks import Deadline
+
+NEAR = 1e-5  # of a share of a line at which the search for its end stops [m]
+MOST_ADVANCES = 500
+ARC = np.radians(5.0)  # of a turn that a straight line replaces [rad]
+LATE = "the time is over"
+BLEND = 0.4  # of the way between two poses of a turn
+HAND_ROOM = 1e-4  # to the limits of a synergy, which motions at another rate need at rests
+DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
+EXAMINED = 50  # states at which that is examined
+
+
+class StepFailed(Exception):  # noqa: N818 - an outcome, not an error
+    """A step that cannot be done from a state.
+
+    Attributes:
+        cause: The reason without the numbers of this state, by which failures are counted.
+    """
+
+    def __init__(self, reason: str, cause: str = "") -> None:
+        """Give the reason, and the cause if it is another text."""
+        super().__init__(reason)
+        self.cause = cause or reason
+
+
+@dataclass(frozen=True, eq=False)
+class StepPlan:
+    """A step that was planned and proved.
+
+    Attributes:
+        step: The step.
+        world: The world during it.
+        after: The world after it.
+        path: Its path.
+        motion: Its timed motion from rest to rest, or None where it is not timed.
+        clearance: Least distance of a checked pair along the motion, or else along the path [m].
+        left: Time from which on, or state of the path from which on, a retreating hand touches nothing any more; NaN
+            of other steps.
+        use: Largest share of each limit that the motion uses.
+        deviation: Largest distance of the motion from the path [rad].
+    """
+
+    step: AnyStep
+    world: TaskWorld
+    after: TaskWorld
+    path: Path
+    motion: Trajectory | None
+    clearance: float
+    left: float = nan
+    use: Mapping[str, float] = field(default_factory=dict)
+    deviation: float = 0.0
+
+    @property
+    def end(self) -> Array:
+        """The last state, shape (dof,)."""
+        last: Array = self.path.states[-1] if self.motion is None else self.motion.positions[-1]
+        return last
+
+
+class StepPlanner:
+    """Plans steps of one problem with a checker of its own.
+
+    Attributes:
+        checker: The checker; each step changes its scene.
+        problem: The problem.
+    """
+
+    def __init__(
+        self, checker: CollisionChecker, problem: Problem, deadline: Deadline, pressed: Callable[[], bool]
+    ) -> None:
+        """Plan by ``checker`` until a deadline, or until ``pressed`` holds."""
+        self.checker, self.problem = checker, problem
+        self._deadline, self._pressed = deadline, pressed
+
+    def _ends(self) -> bool:
+        return self._pressed() or self._deadline.expired
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.checker.robot
+
+    def follow(
+        self, steps: Sequence[AnyStep], world: TaskWorld, q: Array, timing: Timing | None, deadline: Deadline
+    ) -> list[StepPlan]:
+        """Return the plans of steps, which are no motions to further goals, one after the other.
+
+        Args:
+            steps: The steps.
+            world: The world before them.
+            q: The state before them, shape (dof,).
+            timing: How they are timed, or None for paths alone.
+            deadline: When they are to be ready.
+
+        Raises:
+            StepFailed: One cannot be done; the message names it.
+        """
+        self._deadline, found = deadline, list[StepPlan]()
+        for step in steps:
+            try:
+                found.append(self.plan(world, step, q, timing))
+            except StepFailed as failure:
+                raise StepFailed(f"{step.title}: {failure}", f"{step.title}: {failure.cause}") from None
+            world, q = found[-1].after, found[-1].end
+        return found
+
+    def plan(self, world: TaskWorld, step: AnyStep, q: Array, timing: Timing | None) -> StepPlan:
+        """Return a step from a state, shape (dof,).
+
+        Raises:
+            StepFailed: It cannot be done.
+        """
+        if isinstance(step, WaitStep):
+            return self._wait(world, step, q, timing)
+        if isinstance(step, LineStep):
+            return self._line(world, step, q, [self._poses(world, step, q)], timing)
+        if isinstance(step, TurnStep):
+            return self._line(world, step, q, self._turned(world, step, q), timing)
+        if isinstance(step, RetreatStep):
+            return self._retreat(world, step, q, timing)
+        assert not isinstance(step, MoveStep)
+        return self._hand(world, step, q, timing)
+
+    def _become(self, world: TaskWorld, pairs: frozenset[tuple[str, str]] | None = None) -> None:
+        self.checker.become(world.scene, world.held, world.pairs if pairs is None else pairs)
+
+    def _poses(self, world: TaskWorld, step: LineStep, q: Array) -> dict[str, Array]:
+        """Return the poses of the frames at the end of a line, shape (4, 4) each."""
+        frames = {name: frame_of(self.robot, name, world.held) for name in step.frame}
+        poses = {name: self.robot.link_pose(q, frame.link) @ frame.pose for name, frame in frames.items()}
+        if step.onto is not None:
+            name = step.frame[0]
+            return {name: self._aligned(world, step, q, poses[name])}
+        assert step.by is not None
+        moves = {
+            name: np.array(step.by) if step.axes == "world" else pose[:3, :3] @ np.array(step.by)
+            for name, pose in poses.items()
+        }
+        share = 1.0 if step.gap is None else self._share(world, moves, step.gap, q)
+        for name, pose in poses.items():
+            pose[:3, 3] += share * moves[name]
+        return poses
+
+    def _aligned(self, world: TaskWorld, step: LineStep, q: Array, pose: Array) -> Array:
+        """Return the pose of a frame in which its contact face is aligned with another one."""
+        assert step.onto is not None and step.distance is not None
+        moved, fixed = world.face(step.frame[0], q), world.face(step.onto, q)
+        assert moved is not None and fixed is not None
+        turn = pin.Quaternion.FromTwoVectors(moved[1], -fixed[1]).matrix()
+        made = np.eye(4)
+        made[:3, :3] = turn @ pose[:3, :3]
+        made[:3, 3] = turn @ (pose[:3, 3] - moved[0]) + fixed[0] + step.distance * fixed[1]
+        return made
+
+    def _turned(self, world: TaskWorld, step: TurnStep, q: Array) -> list[dict[str, Array]]:
+        """Return the poses of frames along a turn about the origin of the first, a few degrees apart."""
+        poses = {}
+        for name in step.frame:
+            frame = frame_of(self.robot, name, world.held)
+            poses[name] = self.robot.link_pose(q, frame.link) @ frame.pose
+        first = poses[step.frame[0]]
+        to = np.asarray(step.to, float) / length(step.to)
+        turn = pin.AngleAxis(pin.Quaternion.FromTwoVectors(first[:3, 2], to))
+        count = max(1, int(np.ceil(turn.angle / ARC))) if len(poses) > 1 else 1  # its own origin needs no arc
+        found = []
+        for k in range(1, count + 1):
+            part = np.eye(4)
+            part[:3, :3] = pin.AngleAxis(turn.angle * k / count, turn.axis).toRotationMatrix()
+            part[:3, 3] = first[:3, 3] - part[:3, :3] @ first[:3, 3]
+            found.append({name: part @ pose for name, pose in poses.items()})
+        return found
+
+    def _share(self, world: TaskWorld, moves: Mapping[str, Array], gap: float, q: Array) -> float:
+        """Return the share of displacements after which a moved object is at a gap from another body, 1 at most.
+
+        Conservative advancement: a body that is d away is not reached before the displacement is that long.
+
+        Raises:
+            StepFailed: It is nearer than that at the start.
+        """
+        others = [world_geometry(body) for body in (*self.robot.fixtures, *world.scene.values())]
+        others += [(coal_geometry(o), self._pose(world, n, q)) for n, o in world.held.items() if n not in moves]
+        least, request = 1.0, coal.DistanceRequest()
+        for name, move in moves.items():
+            shape, start, share, size = coal_geometry(world.held[name]), self._pose(world, name, q), 0.0, length(move)
+            for _ in range(MOST_ADVANCES if others else 0):
+                placed = _transform(start, share * move)
+                away = min(
+                    coal.distance(shape, placed, other, _transform(pose), request, coal.DistanceResult())
+                    for other, pose in others
+                )
+                if share == 0.0 and away < gap:
+                    raise StepFailed(f"{name} is {1e3 * away:.3g} mm from another body at its start, less than the gap")
+                if away - gap < NEAR or share >= least:
+                    break
+                share += (away - gap) / size
+            least = min(least, share) if others else least
+        return least
+
+    def _pose(self, world: TaskWorld, name: str, q: Array) -> Array:
+        """Return the pose of a held object in the world, shape (4, 4)."""
+        one = world.held[name]
+        return self.robot.link_pose(q, one.link) @ one.pose
+
+    def _line(
+        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, poses: Sequence[Mapping[str, Array]],
+        timing: Timing | None,
+    ) -> StepPlan:  # fmt: skip
+        """Return straight lines from poses of frames to poses, with blends between them."""
+        self._become(world)
+        query = line_query(
+            self.checker, q, list(poses), frame=None, blend=_blend(poses), speed=step.speed,
+            timing=False if timing is None else _timing_in(world, timing), problem=lambda goals: self.problem,
+        )  # fmt: skip
+        found = plan_along(self.checker, query, self._deadline, self._ends)
+        if not found or found.path is None:
+            raise StepFailed(found.reason, " ".join((f"{found.end}", *found.blocked_by)))
+        path = found.path
+        if not np.array_equal(path.states[0], q):
+            raise StepFailed("the line does not start in the state before it")
+        clearance = found.clearance if found.trajectory is None else found.motion_clearance
+        if np.isnan(clearance):  # the frames are there already
+            clearance = self.checker.clearance(q)
+        return StepPlan(
+            step, world, world.after(step, path.states[-1]), path, found.trajectory, clearance, use=found.limit_use,
+            deviation=0.0 if found.trajectory is None else found.deviation,
+        )  # fmt: skip
+
+    def _hand(
+        self, world: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array, timing: Timing | None
+    ) -> StepPlan:
+        """Return a hand that opens or closes."""
+        synergy, during = self.robot.hands[step.hand].synergy, world
+        to = step.to
+        if isinstance(step, GraspStep):
+            during = world.grasped(step, q)
+            if to is None and synergy is not None:
+                to = self._closed(during, step, q)
+        end = q.copy()
+        if synergy is not None and to is not None:
+            k, limits = self.robot.joint_names.index(synergy), self.robot.limits
+            wanted = float(np.clip(to, limits.lower[k] + HAND_ROOM, limits.upper[k] - HAND_ROOM))
+            end[k] = q[k] if abs(wanted - q[k]) <= HAND_ROOM else wanted
+        states = np.stack([q, end]) if (end != q).any() else q[None]
+        self._become(during)
+        check = full_check(self.checker, states, q, [end], deadline=self._deadline.at)
+        if not check or check.proof is None:
+            raise StepFailed(LATE if check.timed_out else check.reason)
+        found = StepPlan(step, during, world.after(step, end), Path(states), None, check.proof.clearance)
+        return found if timing is None else self._timed(found, timing)
+
+    def _closed(self, during: TaskWorld, step: GraspStep, q: Array) -> float:
+        """Return the synergy at which a hand is just before contact with its object.
+
+        Raises:
+            StepFailed: The open hand is in contact with it.
+        """
+        one, palm = during.held[step.object], self.robot.hands[step.hand].palm
+        pose = np.linalg.inv(self.robot.link_pose(q, palm)) @ self._pose(during, step.object, q)
+        turn = pin.Quaternion(pose[:3, :3]).coeffs()
+        placed = one.model_copy(
+            update={"position": tuple(pose[:3, 3]), "orientation": tuple(turn), "links": None, "link": palm}
+        )
+        try:
+            closed = grasp(self.robot, step.hand, placed)
+        except SceneError as error:
+            raise StepFailed(str(error)) from None
+        return float(np.floor(closed.synergy * 1e3) / 1e3)
+
+    def _timed(self, plan: StepPlan, timing: Timing) -> StepPlan:
+        """Return a step with its motion.
+
+        Raises:
+            StepFailed: There is none in time.
+        """
+        world, states, limits = plan.world, plan.path.states, self.robot.limits
+        how, clear = _timing_in(world, timing), [nan]
+        scaled = how.limits(limits, self.robot.joint_names)
+        more = how.motion_limits(self.robot, tuple(world.held.values()), self.problem.payload)
+
+        def fault(motion: Trajectory) -> str:
+            over = [f"{name} {share:.4f}" for name, share in motion.use(scaled).items() if share > 1.0 + ROUNDING]
+            if over:
+                return f"the share of a limit that it uses is over 1: {', '.join(over)}"
+            check = full_check(self.checker, motion, states[0], states[-1:], deadline=self._deadline.at)
+            clear.append(nan if check.proof is None else check.proof.clearance)
+            return check.reason
+
+        try:
+            made = time_path(states, limits, self.robot.joint_names, how, fault, stop=self._ends, motion_limits=more)
+        except TimingError as error:
+            raise StepFailed(f"it cannot be timed, {error}") from None
+        motion = made.trajectory
+        use = motion.use(limits) | ({} if more is None else more.use(motion))
+        return replace(plan, motion=motion, clearance=clear[-1], use=use, deviation=made.deviation)
+
+    def _wait(self, world: TaskWorld, step: WaitStep, q: Array, timing: Timing | None) -> StepPlan:
+        """Return a rest."""
+        self._become(world)
+        states, motion = q[None], None
+        check = full_check(self.checker, states, q, deadline=self._deadline.at)
+        if not check or check.proof is None:
+            raise StepFailed(LATE if check.timed_out else check.reason)
+        if timing is not None:
+            still = np.zeros((2, len(q)))
+            motion = Trajectory(
+                np.array([0.0, step.seconds]), np.stack([q, q]), still, still.copy(), self.robot.joint_names
+            )
+        return StepPlan(step, world, world, Path(states), motion, check.proof.clearance)
+
+    def _retreat(self, world: TaskWorld, step: RetreatStep, q: Array, timing: Timing | None) -> StepPlan:
+        """Return a hand's way from what it released, which it may touch on the first part of the way only."""
+        hand = self.robot.hands[step.hand]
+        frame = frame_of(self.robot, step.hand, world.held)
+        pose = self.robot.link_pose(q, frame.link) @ frame.pose
+        direction = -np.asarray(hand.axis, float) if step.direction is None else np.asarray(step.direction, float)
+        pose[:3, 3] += step.distance / length(direction) * (pose[:3, :3] @ direction)
+        found = self._line(world, step, q, [{step.hand: pose}], timing)
+        pairs = world.leaving_pairs(step.hand)
+        if not pairs:
+            return replace(found, left=0.0)
+        self._become(world, world.pairs - pairs)
+        left, clearance = self._left(found, step, world)
+        self._check_depths(found, left, pairs)
+        return replace(found, left=left, clearance=min(clearance, found.clearance))
+
+    def _left(self, found: StepPlan, step: RetreatStep, world: TaskWorld) -> tuple[float, float]:
+        """Return from where on a retreat is proved without contact, by bisection, and the clearance from there [m].
+
+        Raises:
+            StepFailed: It ends in contact.
+        """
+        states, motion = found.path.states, found.motion
+        places: Sequence[float] = range(len(states)) if motion is None else motion.times.tolist()
+
+        def clearance_from(k: int) -> float | None:
+            rest = states[k:] if motion is None else motion.after(places[k]) if places[k] > 0.0 else motion
+            check = full_check(self.checker, rest, deadline=self._deadline.at)
+            if check.timed_out:
+                raise StepFailed(LATE)
+            return None if not check or check.proof is None else check.proof.clearance
+
+        low, high = -1, len(places) - 2 if len(places) > 1 else 0  # from ``high`` on it is proved
+        clearance = clearance_from(high)
+        if clearance is None:
+            names = " and ".join(world.leaving[step.hand])
+            raise StepFailed(f"it ends in contact with {names}, so a longer retreat is needed")
+        while high - low > 1:
+            middle = (low + high) // 2
+            better = clearance_from(middle)
+            if better is None:
+                low = middle
+            else:
+                high, clearance = middle, better
+        return float(places[high]), clearance
+
+    def _check_depths(self, plan: StepPlan, left: float, pairs: frozenset[tuple[str, str]]) -> None:
+        """Check that contact with what a hand leaves does not become deeper until it has left it.
+
+        Args:
+            plan: The retreat.
+            left: Where it has left it, a time or a number of states.
+            pairs: What may touch until then.
+
+        Raises:
+            StepFailed: It does.
+        """
+        known, first, states = {frozenset(pair) for pair in pairs}, 0.0, plan.path.states
+        for k, place in enumerate(np.linspace(0.0, left, EXAMINED if left > 0.0 else 1).tolist()):
+            i = min(int(place), len(states) - 1)
+            q = states[i] + (place - i) * (states[min(i + 1, len(states) - 1)] - states[i])
+            q = q if plan.motion is None else plan.motion(place)
+            found = [] if self.checker.is_free(q) else self.checker.contacts(q)
+            found = [c for c in found if frozenset((c.first, c.second)) in known]
+            depth = max((c.depth for c in found), default=0.0)
+            first = depth if k == 0 else first
+            if depth > first + DEEPER:
+                worst = max(found, key=lambda c: c.depth)
+                bodies = f"{worst.first} and {worst.second}"
+                raise StepFailed(f"{bodies} would overlap by {1e3 * depth:.1f} mm on the way", f"overlap {bodies}")
+
+
+def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
+    """Return the radius of blends between poses: a share of the shortest way of a frame from one to the next [m]."""
+    ways = [
+        length(following[name][:3, 3] - pose[:3, 3]) for one, following in pairwise(poses) for name, pose in one.items()
+    ]
+    return BLEND * min((way for way in ways if way > SAME_POINT), default=0.0)
+
+
+def _timing_in(world: TaskWorld, timing: Timing) -> Timing:
+    """Return a timing of a step: from rest, and without tools that are not held then."""
+    speeds = timing.max_tool_speed
+    if isinstance(speeds, Mapping):
+        known = {*world.held, *world.robot.hands, *world.robot.link_names}
+        speeds = {name: speed for name, speed in speeds.items() if name in known} or None
+    return replace(timing, minimum_duration=0.0, start_velocity=(), start_acceleration=(), max_tool_speed=speeds)
+
+
+def _transform(pose: Array, move: Array | float = 0.0) -> coal.Transform3s:
+    """Return a pose, shape (4, 4), moved by a displacement in the world, shape (3,), for Coal."""
+    return coal.Transform3s(pose[:3, :3], pose[:3, 3] + move)

@@ -1,0 +1,267 @@
+"""The world between the steps of a task: who holds what, what stands in the scene, and which contacts are allowed.
+
+A world is a record; each step returns the next one. Names are checked by going through all steps once, before anything
+is planned (:func:`check_steps`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.constraints.frames import LinkFace, frame_of
+from apex_ompl.errors import ApexError, FileFormatError, ParameterError, UnknownNameError
+from apex_ompl.ompl.setup import workspace_goal
+from apex_ompl.planning.line_query import tools_of
+from apex_ompl.robot import Robot
+from apex_ompl.robot.model import link_of
+from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
+from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
+from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep
+from apex_ompl.types import Array
+from apex_ompl.util.schema import validate
+
+Pair = tuple[str, str]
+HELD = ("link", "links", "touch_links", "contact")  # fields that an object has only while it is held
+
+
+@dataclass(frozen=True)
+class TaskWorld:
+    """Obstacles, held objects and contacts that are allowed, during one step.
+
+    Attributes:
+        robot: The robot.
+        scene: Obstacles by name, those that were released among them.
+        held: Held objects by name.
+        allowed: Pairs of bodies that may touch.
+        leaving: Hand -> objects that it released and may still touch.
+        faces: Contact faces of released objects by name.
+    """
+
+    robot: Robot
+    scene: Mapping[str, Obstacle]
+    held: Mapping[str, AttachedObject]
+    allowed: frozenset[Pair]
+    leaving: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    faces: Mapping[str, ContactFace] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, robot: Robot, problem: Problem) -> TaskWorld:
+        """Return the world of a problem on the way to its goal."""
+        scene, held = {o.name: o for o in problem.scene}, {one.name: one for one in problem.attached}
+        return cls(robot, scene, held, frozenset(problem.allowed))
+
+    @property
+    def pairs(self) -> frozenset[Pair]:
+        """Pairs that may touch, with those of hands and what they are leaving."""
+        return self.allowed | {pair for hand in self.leaving for pair in self.leaving_pairs(hand)}
+
+    def leaving_pairs(self, hand: str) -> frozenset[Pair]:
+        """Return the pairs of the links of a hand and the objects that it is leaving."""
+        solid = {link_of(self.robot.model, item) for item in self.robot.geometry.geometryObjects}
+        links = [link for link in hand_links(self.robot, hand) if link in solid]
+        return frozenset((link, name) for name in self.leaving.get(hand, ()) for link in links)
+
+    def held_by(self, hand: str) -> tuple[str, ...]:
+        """Return the names of the objects that a hand holds, alone or with another one."""
+        links = hand_links(self.robot, hand)
+        return tuple(name for name, one in self.held.items() if any(link in links for link in one.holders))
+
+    def face(self, name: str, q: Array) -> tuple[Array, Array] | None:
+        """Return center and outward axis of a contact face in the world, shape (3,) each, or None where there is none.
+
+        Args:
+            name: A hand, a held object, or one that was released.
+            q: State, shape (dof,).
+        """
+        if name in self.scene and name in self.faces:
+            pose, face = self.scene[name].pose, self.faces[name]
+            axis = pose[:3, :3] @ np.asarray(face.axis, float)
+            return pose[:3, :3] @ np.asarray(face.point, float) + pose[:3, 3], axis / np.linalg.norm(axis)
+        if name in self.robot.hands:
+            fixed = LinkFace.of_hand(self.robot, name)
+        elif name in self.held and self.held[name].contact is not None:
+            fixed = LinkFace.of_object(self.held[name])
+        else:
+            return None
+        pose = self.robot.link_pose(q, fixed.link)
+        return pose[:3, :3] @ fixed.point + pose[:3, 3], pose[:3, :3] @ fixed.axis
+
+    def problem(self, given: Problem, goal: Goal, q: Array) -> Problem:
+        """Return the problem of going on from a state to a further goal.
+
+        Args:
+            given: The problem that the task is part of.
+            goal: The goal.
+            q: The state, shape (dof,).
+        """
+        start = dict(zip(self.robot.joint_names, q.tolist(), strict=True))
+        if goal.joints is not None:
+            goal = Goal(joints=tuple(start | dict(values) for values in goal.joints))
+        return given.model_copy(
+            update={
+                "scene": tuple(self.scene.values()), "attached": tuple(self.held.values()),
+                "allowed": tuple(sorted(self.pairs)), "start": start, "goal": goal, "constraints": (), "after": (),
+            }
+        )  # fmt: skip
+
+    def after(self, step: AnyStep, q: Array) -> TaskWorld:
+        """Return the world after a step that ends in a state, shape (dof,).
+
+        Raises:
+            ApexError: The hand or the object of the step is unknown, or not held.
+        """
+        if isinstance(step, ReleaseStep):
+            return self._released(step, q)
+        if isinstance(step, GraspStep):
+            return self.grasped(step, q)
+        if isinstance(step, RetreatStep):
+            return replace(self, leaving={hand: names for hand, names in self.leaving.items() if hand != step.hand})
+        return self
+
+    def _released(self, step: ReleaseStep, q: Array) -> TaskWorld:
+        mine = self.held_by(step.hand)
+        scene, held, faces, gone = dict(self.scene), dict(self.held), dict(self.faces), set[str]()
+        names = mine if step.objects is None else step.objects
+        for name in names:
+            one = held.pop(name)
+            pose = self.robot.link_pose(q, one.link) @ one.pose
+            others = [link for link in one.holders if link not in hand_links(self.robot, step.hand)]
+            if others:
+                inside = np.linalg.inv(self.robot.link_pose(q, others[0])) @ pose
+                fields: dict[str, Any] = given_fields(one, ("link", "links", "touch_links"))
+                held[name] = _read(AttachedObject, {**fields, "link": others[0], **pose_fields(inside)})
+            elif step.falls:
+                gone.add(name)
+            else:
+                scene[name] = _read(Obstacle, {**given_fields(one, HELD), **pose_fields(pose)})
+                if one.contact is not None:
+                    faces[name] = one.contact
+        left = (*self.leaving.get(step.hand, ()), *(name for name in names if name not in gone))
+        allowed = frozenset(pair for pair in self.allowed if not gone & {*pair})
+        leaving = {**self.leaving, step.hand: left} if left else self.leaving
+        return replace(self, scene=scene, held=held, faces=faces, allowed=allowed, leaving=leaving)
+
+    def grasped(self, step: GraspStep, q: Array) -> TaskWorld:
+        """Return the world in which the hand of a step holds its object, taken where it is at a state, shape (dof,)."""
+        palm, name = self.robot.hands[step.hand].palm, step.object
+        scene, held, faces = dict(self.scene), dict(self.held), dict(self.faces)
+        if name in held:
+            one = held[name]
+            fields: dict[str, Any] = given_fields(one, ("links", "touch_links"))
+            held[name] = _read(AttachedObject, {**fields, "links": (one.link, palm)})
+        else:
+            obstacle, face = scene.pop(name), faces.pop(name, None)
+            pose = np.linalg.inv(self.robot.link_pose(q, palm)) @ obstacle.pose
+            fields = {**given_fields(obstacle, MOTION), "link": palm, **pose_fields(pose)}
+            held[name] = _read(AttachedObject, fields | ({} if face is None else {"contact": face}))
+        leaving = {hand: tuple(n for n in names if n != name) for hand, names in self.leaving.items()}
+        return replace(self, scene=scene, held=held, faces=faces, leaving={h: n for h, n in leaving.items() if n})
+
+
+def hand_links(robot: Robot, hand: str) -> tuple[str, ...]:
+    """Return the links of a hand by name."""
+    return robot.hand_of(robot.hands[hand].palm)
+
+
+def check_steps(robot: Robot, problem: Problem) -> None:
+    """Check the names in the steps after the goal of a problem, and who holds what at each step.
+
+    Raises:
+        FileFormatError: A hand, a frame or an object is unknown, or a hand does not hold what it is to release; the
+            message names the step.
+    """
+    world, q = TaskWorld.of(robot, problem), robot.within_limits(problem.start_state(robot.joint_names))
+    if problem.after and problem.moving:
+        raise FileFormatError(
+            problem.source, "after", problem.moving[0], "expected no steps after the goal beside an obstacle that moves"
+        )
+    for k, step in enumerate(problem.after):
+        for name, value, expected in _faults(world, step):
+            raise FileFormatError(problem.source, f"after.{k}.{name}", value, expected)
+        if isinstance(step, MoveStep):
+            moved = world.problem(problem, step.goal, q)
+            try:
+                workspace_goal(robot, moved)
+                moved.goal_states(robot.joint_names)
+            except ApexError as error:
+                raise FileFormatError(
+                    problem.source, f"after.{k}.goal", str(error), "expected a possible goal"
+                ) from None
+        world = world.after(step, q)
+
+
+def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]]:
+    """Yield field, value and what was expected, for each fault of a step."""
+    if isinstance(step, LineStep | TurnStep):
+        yield from _frame_faults(world, step)
+    elif isinstance(step, HandStep | ReleaseStep | GraspStep | RetreatStep):
+        yield from _hand_faults(world, step)
+
+
+def _hand_faults(
+    world: TaskWorld, step: HandStep | ReleaseStep | GraspStep | RetreatStep
+) -> Iterable[tuple[str, object, str]]:
+    hands = world.robot.hands
+    if step.hand not in hands:
+        yield "hand", step.hand, f"expected a hand: {', '.join(hands) or 'the robot has none'}"
+        return
+    if isinstance(step, HandStep) and hands[step.hand].synergy is None:
+        yield "hand", step.hand, "expected a hand that opens and closes"
+    if isinstance(step, GraspStep):
+        yield from _grasp_faults(world, step)
+    if isinstance(step, ReleaseStep):
+        mine = world.held_by(step.hand)
+        if not mine:
+            yield "hand", step.hand, "expected a hand that holds an object then"
+        for name in step.objects or ():
+            if name not in mine:
+                yield "objects", name, f"expected an object that {step.hand} holds then: {', '.join(mine)}"
+
+
+def _frame_faults(world: TaskWorld, step: LineStep | TurnStep) -> Iterable[tuple[str, object, str]]:
+    robot = world.robot
+    for name in step.frame:
+        try:
+            frame_of(robot, name, world.held)
+        except UnknownNameError as error:
+            yield "frame", name, f"expected a hand, a link or an object that is held then: {', '.join(error.known)}"
+            return
+        if isinstance(step, LineStep) and step.gap is not None and name not in world.held:
+            yield "gap", step.gap, f"expected none, since {name!r} is no held object"
+    try:
+        tools_of(robot, step.frame, [frame_of(robot, name, world.held) for name in step.frame])
+    except ParameterError as error:
+        yield "frame", error.value, f"expected {error.expected}"
+    onto = step.onto if isinstance(step, LineStep) else None
+    for name in (step.frame[0], onto) if onto is not None else ():
+        if world.face(name, robot.home) is None:
+            known = name in world.held or name in world.scene
+            expected = "a contact face" if known else "a hand, or a held or released object,"
+            yield "onto" if name == onto else "frame", name, f"expected {expected} to align"
+
+
+def _grasp_faults(world: TaskWorld, step: GraspStep) -> Iterable[tuple[str, object, str]]:
+    one, synergy = world.held.get(step.object), world.robot.hands[step.hand].synergy
+    if one is None and step.object not in world.scene:
+        known = ", ".join((*world.held, *world.scene)) or "there is none"
+        yield "object", step.object, f"expected an obstacle or a held object: {known}"
+    if step.object in world.held_by(step.hand):
+        yield "object", step.object, f"expected an object that {step.hand} does not hold yet"
+    elif one is not None and len(one.holders) > 1:
+        yield "object", step.object, "expected an object that one hand holds, not two"
+    if step.to is not None and synergy is None:
+        yield "to", step.to, "expected none, since the hand does not close"
+    shape = world.scene.get(step.object)
+    if shape is not None and (shape.half_space is not None or shape.points is not None):
+        yield "object", step.object, "expected a solid that can be held"
+
+
+def _read(kind: Any, given: dict[str, Any]) -> Any:
+    try:
+        return validate(kind, given, "task")
+    except ApexError as error:
+        raise AssertionError(f"a body of the world is faulty: {error}") from error
