@@ -1,29 +1,32 @@
 """Depth images, labels and colors of surfaces as a camera sees them, by two renderers, and the noise of depth cameras.
 
-``ZBuffer`` is compiled code of the kernel, ``Vtk`` draws by VTK (the extra ``viz``); they share nothing but the
-triangles. Both draw the camera as a pinhole; its distortion is applied to the images.
+``ZBuffer`` is compiled code of the kernel, ``Mujoco`` draws by MuJoCo and OpenGL (the extra ``twin``); they share
+nothing but the triangles of meshes. Both draw the camera as a pinhole; its distortion is applied to the images.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, NamedTuple, Protocol
 
+import coal
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
-from apex_ompl.errors import MissingFileError
+from apex_ompl.collision.shapes import cloud_of
+from apex_ompl.drivers.geoms import geom_shapes
+from apex_ompl.drivers.library import mujoco
 from apex_ompl.kernel.perception import draw_triangles
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.surfaces import Surface
 from apex_ompl.types import Array, Indices
-from apex_ompl.util.forking import unforked
 from apex_ompl.util.validation import check_number
 
-FARTHEST = 20.0  # that VTK draws [m]
+FARTHEST = 20.0  # that MuJoCo draws [m]
 NEAREST = 0.05
+SIDES = 64  # of MuJoCo's round bodies; 28 are 1 mm off
 JUMP = 0.03  # difference of neighboring depths at an edge [m]
 MISSING, FLYING = 0.5, 0.2  # shares of pixels at edges without depth, and with one between both sides
 COMMON = 0.8  # part of the noise that neighboring pixels share, as a standard deviation
@@ -37,11 +40,15 @@ class Part(NamedTuple):
         surface: The surface, in the world.
         label: Its number, from 1 on.
         color: Red, green and blue, 0 to 1.
+        solid: The solid whose surface it is, or None.
+        pose: Pose of the solid in the world, shape (4, 4) [m].
     """
 
     surface: Surface
     label: int
     color: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    solid: coal.CollisionGeometry | None = None
+    pose: Array = np.eye(4)
 
 
 class View(NamedTuple):
@@ -121,54 +128,79 @@ class ZBuffer:
         return _seen_through(camera, view)
 
 
-class Vtk:
-    """VTK's renderer, without a display; needs the extra ``viz``."""
+class Mujoco:
+    """MuJoCo's renderer, without a display; needs the extra ``twin``.
+
+    Round bodies are MuJoCo's own, with 64 sides; of other shapes it draws the triangles.
+    """
 
     def __init__(self) -> None:
-        """Load VTK.
+        """Load MuJoCo.
 
         Raises:
-            MissingFileError: The extra ``viz`` is not installed.
+            MissingFileError: The extra ``twin`` is not installed.
         """
-        try:
-            with unforked():
-                self._pv: Any = import_module("pyvista")
-        except ImportError as error:
-            raise MissingFileError("pyvista", "package for renderings", "install the extra: apex-ompl[viz]") from error
+        self._mujoco: Any = mujoco()
 
     def draw(self, parts: Sequence[Part], camera: Camera, pose: Array) -> View:
         """Return what a camera at a pose sees, with normals of differences of depth."""
-        vertices, faces, labels = _together(parts)
-        mesh = self._pv.PolyData.from_regular_faces(vertices, faces)
-        mesh.cell_data["label"] = np.stack([labels % 256, labels // 256, np.zeros_like(labels)], axis=1).astype(np.uint8)
-        plotter = self._pv.Plotter(off_screen=True, window_size=(camera.width, camera.height), lighting="none")
-        try:
-            plotter.set_background("black")
-            plotter.disable_anti_aliasing()
-            plotter.add_mesh(
-                mesh, scalars="label", rgb=True, lighting=False, interpolate_before_map=False, culling="back",
-                show_scalar_bar=False,
-            )  # fmt: skip
-            self._place(plotter, camera, pose)
-            plotter.show(auto_close=False)
-            depth = -np.nan_to_num(np.asarray(plotter.get_image_depth(), float))
-            colors = np.asarray(plotter.screenshot(return_img=True), np.int64)
-        finally:
-            plotter.close()
-        there = depth > 0.0
-        return _seen_through(
-            camera, View(depth, np.where(there, colors[..., 0] + 256 * colors[..., 1], 0), depth_normals(depth, camera))
+        library = self._mujoco
+        spec = library.MjSpec()
+        spec.stat.extent = 1.0  # in which the next two are measured
+        spec.visual.map.znear, spec.visual.map.zfar = NEAREST, FARTHEST
+        quality = spec.visual.quality
+        quality.numslices, quality.numstacks, quality.offsamples = SIDES, SIDES, 0
+        getattr(spec.visual, "global").offwidth = camera.width
+        getattr(spec.visual, "global").offheight = camera.height
+        for k, part in enumerate(parts):
+            self._add(spec, part, k)
+        self._place(spec, camera, pose)
+        model = spec.compile()
+        data = library.MjData(model)
+        library.mj_forward(model, data)
+        with library.Renderer(model, camera.height, camera.width, len(parts) + 100) as renderer:
+            renderer.enable_depth_rendering()
+            renderer.update_scene(data, "camera")
+            depth = np.asarray(renderer.render(), float)
+            renderer.disable_depth_rendering()
+            renderer.enable_segmentation_rendering()
+            renderer.update_scene(data, "camera")
+            number = renderer.render()[..., 0]
+        there = number >= 0
+        depth = np.where(there, depth, 0.0)
+        labels = np.where(there, np.array([part.label for part in parts])[number], 0)
+        return _seen_through(camera, View(depth, labels, depth_normals(depth, camera)))
+
+    def _add(self, spec: Any, part: Part, k: int) -> None:
+        """Add a part as one geom."""
+        geom = spec.worldbody.add_geom(type=self._mujoco.mjtGeom.mjGEOM_MESH)
+        if part.solid is not None and round_or_box(part.solid):
+            shape = next(geom_shapes(part.solid, part.pose, str(k)))
+            geom.type = getattr(self._mujoco.mjtGeom, f"mjGEOM_{shape.kind}")
+            geom.size[: len(shape.size)] = shape.size
+            geom.pos, geom.quat = part.pose[:3, 3], pin.Quaternion(part.pose[:3, :3]).coeffs()[[3, 0, 1, 2]]
+            return
+        geom.meshname = str(k)
+        vertices, faces = part.surface
+        spec.add_mesh(
+            name=str(k), uservert=vertices.ravel(), userface=faces.ravel(), inertia=self._mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         )
 
-    @staticmethod
-    def _place(plotter: Any, camera: Camera, pose: Array) -> None:
-        view = plotter.camera
-        view.position, view.focal_point = pose[:3, 3], pose[:3, 3] + pose[:3, 2]
-        view.up = -pose[:3, 1]
-        view.view_angle = float(np.degrees(2.0 * np.arctan(camera.height / 2.0 / camera.focal[1])))
+    def _place(self, spec: Any, camera: Camera, pose: Array) -> None:
+        """Add the camera; MuJoCo's looks along -z, with y up."""
+        own = spec.worldbody.add_camera(name="camera", pos=pose[:3, 3])
+        flipped = pose[:3, :3] * (1.0, -1.0, -1.0)
+        own.quat = pin.Quaternion(flipped).coeffs()[[3, 0, 1, 2]]
+        own.resolution = [camera.width, camera.height]
+        own.sensor_size = [camera.width, camera.height]
+        own.focal_pixel = camera.focal
         shift = np.array(camera.center) - (np.array([camera.width, camera.height]) - 1.0) / 2.0
-        view.SetWindowCenter(-2.0 * shift[0] / camera.width, 2.0 * shift[1] / camera.height)
-        view.clipping_range = (NEAREST, FARTHEST)
+        own.principal_pixel = [shift[0], shift[1]]
+
+
+def round_or_box(solid: coal.CollisionGeometry) -> bool:
+    """Return whether a solid is a box, ball, cylinder or capsule."""
+    return isinstance(solid, coal.Box | coal.Sphere | coal.Cylinder | coal.Capsule) and cloud_of(solid) is None
 
 
 def depth_normals(depth: Array, camera: Camera) -> Array:

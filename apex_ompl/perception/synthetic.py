@@ -8,23 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Literal
 
+import coal
 import numpy as np
 import pinocchio as pin
-import trimesh
 
+from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.perception.camera import Camera, DepthErrors, look_at
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.rendering import DepthSensor, Light, Part, Renderer, View, ZBuffer, colors, seen_share
-from apex_ompl.perception.surfaces import RobotSurface, Surface, body_surface
-from apex_ompl.problems.objects import DATA, PALM
+from apex_ompl.perception.surfaces import RobotSurface, geometry_surface
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_fields
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number
 
-SLICES = 96  # of round surfaces
+SLICES, LINK_SLICES = 96, 32  # of round surfaces
+PALM = -0.009  # surface of the palm in its frame, along z [m]
 BACKGROUND, TABLES, CLUTTER, LINKS, HELD = 1, 3, 4, 10, 200  # first labels
 GRASP_SHIFT = (0.008, 0.008, 0.003)  # standard deviations along the axes of the palm [m]
 GRASP_TURN = (4.0, 4.0, 10.0)  # about them [degrees]
@@ -59,7 +61,9 @@ KINDS = {
 }
 
 
-def held_object(kind: str, size: Sequence[float], palm: str, side: int, name: str) -> AttachedObject:
+def held_object(
+    kind: str, size: Sequence[float], palm: str, side: int, name: str, meshes: Path
+) -> AttachedObject:  # fmt: skip
     """Return an object of a kind in a palm, its contact face (+z) on the little finger's side.
 
     Args:
@@ -68,6 +72,7 @@ def held_object(kind: str, size: Sequence[float], palm: str, side: int, name: st
         palm: Link of the palm.
         side: -1 for the left hand, 1 for the right one.
         name: Name of the object.
+        meshes: Folder of ``cup.obj`` and ``block.obj``, as the ready-made problems have them.
     """
     a, b, c = map(float, size)
     nominal = KINDS[kind]
@@ -75,8 +80,8 @@ def held_object(kind: str, size: Sequence[float], palm: str, side: int, name: st
     shapes: dict[str, dict[str, Any]] = {
         "box": {"box": (2 * a, 2 * b, 2 * c)}, "can": {"cylinder": {"radius": a, "length": 2 * c}},
         "peg": {"cylinder": {"radius": a, "length": 2 * c}}, "ball": {"sphere": {"radius": a}},
-        "cup": {"mesh": {"file": str(DATA / "cup.obj"), "scale": scale}},
-        "block": {"mesh": {"file": str(DATA / "block.obj"), "scale": scale}},
+        "cup": {"mesh": {"file": str(meshes / "cup.obj"), "scale": scale}},
+        "block": {"mesh": {"file": str(meshes / "block.obj"), "scale": scale}},
     }  # fmt: skip
     half = float(np.sqrt(0.5))
     return AttachedObject.model_validate(
@@ -186,10 +191,21 @@ def default_camera(settings: SyntheticSettings) -> Camera:
 class SceneGenerator:
     """Draws scenes of a robot with two hands."""
 
-    def __init__(self, robot: Robot, renderer: Renderer | None = None, camera: Camera | None = None) -> None:
-        """Collect the robot's surface; the kernel's renderer and a usual camera are the default."""
+    def __init__(
+        self, robot: Robot, meshes: Path, renderer: Renderer | None = None, camera: Camera | None = None
+    ) -> None:
+        """Collect the robot's surface.
+
+        Args:
+            robot: The robot, with two hands.
+            meshes: Folder of ``cup.obj`` and ``block.obj``.
+            renderer: Draws the scenes; the kernel's is the default.
+            camera: By default one of 640 x 480 pixels and 69 degrees.
+        """
         self.robot, self.renderer, self._camera = robot, renderer or ZBuffer(), camera
-        self._surface = RobotSurface(robot, 32)
+        self._meshes = meshes
+        self._surface = RobotSurface(robot, LINK_SLICES)
+        self._links = [geometry_surface(item.geometry, item.name, LINK_SLICES) for item in robot.geometry.geometryObjects]
         rng = np.random.default_rng(5)
         shades = rng.uniform(0.55, 0.95, (len(self._surface.links), 1)) * np.ones(3)
         self._shades = [(float(r), float(g), float(b)) for r, g, b in shades]
@@ -214,7 +230,7 @@ class SceneGenerator:
         parts = self._parts(rng, true_state)
         for k, (_, body, *_, at, _) in enumerate(held):
             if there[k]:
-                parts.append(Part(body_surface(body, SLICES, 4).at(at), HELD + k, _color(rng)))
+                parts.append(solid_part(coal_geometry(body), at, HELD + k, _color(rng)))
         view = self.renderer.draw(parts, camera, pose)
         labels = [HELD + k for k in range(len(held))]
         joints = dict(zip(self.robot.joint_names, state.tolist(), strict=True))
@@ -253,9 +269,9 @@ class SceneGenerator:
         if kind in ("box", "can", "peg", "cup"):
             size[2] *= rng.uniform(0.9, 1.1)
         palm = self.robot.hands[hand].palm
-        body = held_object(kind, size, palm, side, kind)
+        body = held_object(kind, size, palm, side, kind, self._meshes)
         factors = np.exp(rng.normal(0.0, settings.size_spread, 3))[list(TIES[kind])]
-        reported = held_object(kind, size * factors, palm, side, kind).model_copy(
+        reported = held_object(kind, size * factors, palm, side, kind, self._meshes).model_copy(
             update={"position": body.position}
         )
         state[self._synergy(hand)] = KINDS[kind].synergy
@@ -276,27 +292,28 @@ class SceneGenerator:
 
     def _parts(self, rng: np.random.Generator, state: Array) -> list[Part]:
         """Return the robot, its tables with clutter, a wall and the floor."""
-        surface, parts = self._surface, []
-        vertices = surface.seen_from(np.eye(4), surface.poses(state))
-        owner = surface.part[surface.faces[:, 0]]
-        for k in range(len(surface.links)):
-            parts.append(Part(Surface(vertices, surface.faces[owner == k]), LINKS + k, self._shades[k]))
-        parts += [Part(body_surface(one).at(one.pose), TABLES, (0.75, 0.6, 0.45)) for one in self.robot.fixtures]
+        poses = self._surface.poses(state)
+        items = self.robot.geometry.geometryObjects
+        parts = [
+            Part(surface.at(pose), LINKS + k, self._shades[k], item.geometry, pose)
+            for k, (item, surface, pose) in enumerate(zip(items, self._links, poses, strict=True))
+        ]
+        parts += [solid_part(coal_geometry(one), one.pose, TABLES, (0.75, 0.6, 0.45)) for one in self.robot.fixtures]
         wall = _rotation("z", 90.0 + rng.normal(0.0, 15.0))
         wall[:3, 3] = -rng.uniform(0.6, 1.5), 0.0, 0.5
         floor = _rotation("x", 90.0)
         floor[2, 3] = -0.7
-        plate = _made(trimesh.creation.box((4.0, 0.02, 3.0)))
-        parts += [Part(plate.at(wall), BACKGROUND, _color(rng)), Part(plate.at(floor), BACKGROUND, _color(rng))]
+        plate = coal.Box(4.0, 0.02, 3.0)
+        parts += [solid_part(plate, wall, BACKGROUND, _color(rng)), solid_part(plate, floor, BACKGROUND, _color(rng))]
         for k in range(rng.integers(3, 9)):
             if rng.random() < 0.5:
-                shape = trimesh.creation.box(rng.uniform(0.04, 0.2, 3))
+                shape: coal.CollisionGeometry = coal.Box(*rng.uniform(0.04, 0.2, 3))
             else:
-                shape = trimesh.creation.cylinder(rng.uniform(0.02, 0.08), 0.15)
+                shape = coal.Cylinder(rng.uniform(0.02, 0.08), 0.15)
             at = np.eye(4)
             at[:3, :3] = pin.Quaternion(_unit(rng.normal(size=4))).matrix()
             at[:3, 3] = rng.uniform(-0.2, 0.8), rng.uniform(-0.9, 0.9), 0.05
-            parts.append(Part(_made(shape).at(at), CLUTTER + k % 6, _color(rng)))
+            parts.append(solid_part(shape, at, CLUTTER + k % 6, _color(rng)))
         return parts
 
     def _truth(
@@ -304,7 +321,7 @@ class SceneGenerator:
         camera: Camera, pose: Array, there: bool,
     ) -> TrueObject:  # fmt: skip
         _, body, kind, reported, at, size = held
-        alone = self.renderer.draw([Part(body_surface(body).at(at), label)], camera, pose)
+        alone = ZBuffer().draw([solid_part(coal_geometry(body), at, label, (1.0, 1.0, 1.0))], camera, pose)
         face = at[:3, 3] + size[2] * at[:3, 2]
         center = (at[:3, 3] - pose[:3, 3]) @ pose[:3, :3]
         (column, row), edge = camera.project(center), 25.0
@@ -326,6 +343,11 @@ def random_error(rng: np.random.Generator, shift: float, turn: float) -> Array:
     return found
 
 
+def solid_part(solid: coal.CollisionGeometry, pose: Array, label: int, color: tuple[float, float, float]) -> Part:
+    """Return a solid at a pose, shape (4, 4) [m], as a part of a scene."""
+    return Part(geometry_surface(solid, str(label), SLICES, 4).at(pose), label, color, solid, pose)
+
+
 def true_body(one: TrueObject, palm: Array) -> AttachedObject:
     """Return an object as it is truly held in a palm at a pose, shape (4, 4) [m]."""
     return one.body.model_copy(update=pose_fields(np.linalg.inv(palm) @ one.pose))
@@ -344,7 +366,3 @@ def _rotation(axis: str, degrees: float) -> Array:
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
     r, g, b = rng.uniform(0.1, 0.95, 3)
     return float(r), float(g), float(b)
-
-
-def _made(mesh: Any) -> Surface:
-    return Surface(np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
