@@ -192,6 +192,14 @@ class HeldObjectFinder:
             found.append(Expected(body, surface, ties, factor, link @ body.pose, turned(spread, link[:3, :3])))
         return found
 
+    def by_grasp(self, frame: Frame) -> tuple[HeldObject, ...]:
+        """Return the objects as their grasps have them, in the order of ``attached``.
+
+        Raises:
+            ApexError: The frame has no position of a joint.
+        """
+        return tuple(_without(one, "") for one in self.expected(frame.state(self.robot.joint_names)))
+
     def find(self, frame: Frame, frames: int = 1) -> tuple[HeldObject, ...]:
         """Return where the objects are, in the order of ``attached``.
 
