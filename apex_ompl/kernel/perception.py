@@ -15,6 +15,7 @@ from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.compiled.perception import rasterizer, registration, surface_fit
 from apex_ompl.types import Array
 
+AXIS, BALL = surface_fit.AXIS, surface_fit.BALL
 POSE = registration.POSE  # unknowns of a camera: turn, shift, scale of depth
 
 
@@ -195,8 +196,8 @@ class SurfaceFit(NamedTuple):
 
 
 def fit_surface(
-    points: Array, beyond: Array, lens: Array, vertices: Array, faces: Integers, ties: Integers, start: Array,
-    expected: Array, prior: Array, settings: FitSettings,
+    points: Array, beyond: Array, lens: Array, vertices: Array, faces: Integers, ties: Integers, symmetry: int,
+    start: Array, expected: Array, prior: Array, settings: FitSettings, outline: int | None = None,
 ) -> SurfaceFit:  # fmt: skip
     """Fit the pose of a surface to points and to pixels that it must not cover.
 
@@ -207,11 +208,13 @@ def fit_surface(
         vertices: In the frame of the object, shape (V, 3) [m].
         faces: Triangles, shape (F, 3).
         ties: Unknown of the scale along each axis, 0 to 2, shape (3,).
+        symmetry: ``AXIS`` of a body of revolution about its z, ``BALL``, or 0 for none.
         start: Pose to start from, shape (4, 4) [m].
         expected: Pose expected before, shape (4, 4) [m].
         prior: Information of turn and shift from there in the axes of the optical frame, shape (6, 6), and of the
             logarithms of the scales where these are unknown, shape (9, 9).
         settings: Weights and limits.
+        outline: Points from this one on only have to be inside the outline; their depths are guessed.
     """
     n = len(prior)
     rotation, position, scale = start[:3, :3].copy(), start[:3, 3].copy(), np.ones(3)
@@ -220,7 +223,7 @@ def fit_surface(
     s = settings
     numbers = s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach
     cost = surface_fit.fit_surface(
-        np.ascontiguousarray(points), beyond, lens, vertices, faces, ties, rotation, position, scale,
+        np.ascontiguousarray(points), len(points) if outline is None else outline, beyond, lens, vertices, faces, ties, symmetry, rotation, position, scale,
         expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), s.steps,
         np.empty_like(vertices), depth, index, matrix, np.empty((n, n)), np.empty(n), cross, np.empty(n),
         np.empty(POSE),

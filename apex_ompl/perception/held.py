@@ -18,6 +18,8 @@ import trimesh
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.perception import (
+    AXIS,
+    BALL,
     FitSettings,
     SurfaceFit,
     Window,
@@ -27,21 +29,22 @@ from apex_ompl.kernel.perception import (
 )
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.registration import Registration, RegistrationSettings, register
-from apex_ompl.perception.rendering import lens_of, resampled, undistorted
+from apex_ompl.perception.registration import CorrectedFrame, Registration, RegistrationSettings, corrected
+from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.surfaces import RobotSurface, Surface, body_surface, inverse
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
-CALIBRATION = {"box": 0.84, "cylinder": 0.81, "capsule": 0.81, "sphere": 0.73, "mesh": 0.93, "thin mesh": 1.41}
-"""Factors of covariances by shape: mean squared normalized errors over their number of dimensions, without factors.
+INFLATION = {"box": 1.0, "cylinder": 1.0, "capsule": 1.0, "sphere": 1.0, "mesh": 1.0, "thin mesh": 1.0}
+"""Factors of the variances of measurements by shape: mean squared normalized errors over their number of dimensions.
 
 They are those of ``python -m benchmarks.perception.held --calibrate``, on scenes of their own. Walls that are thin may be
 taken for one another.
 """
 THIN = 0.5  # share of the volume of its hull below which a mesh is thin
+ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in which they agree, and their least number
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
@@ -72,8 +75,8 @@ class HeldSettings:
     size_spread: float = 0.0
     registration: RegistrationSettings | None = field(default_factory=RegistrationSettings)
     thickness: float = 0.005
-    floor: float = 0.001
-    edge: float = 0.7
+    floor: float = 0.0005
+    edge: float = 0.4
     point_share: float = 1.4
     contour_share: float = 0.15
     starts: tuple[float, ...] = (0.0, -18.0, 18.0)
@@ -141,7 +144,8 @@ class Expected(NamedTuple):
         body: The object.
         surface: Its surface.
         ties: Unknown of the scale along each axis, shape (3,).
-        factor: Factor of the covariance of its fits.
+        symmetry: ``AXIS``, ``BALL``, or 0.
+        inflation: Factor of the variances of its measurements.
         pose: Its pose in the world, shape (4, 4) [m].
         covariance: Of a turn and a shift in the axes of the world, shape (6, 6).
     """
@@ -149,7 +153,8 @@ class Expected(NamedTuple):
     body: AttachedObject
     surface: Surface
     ties: Indices
-    factor: float
+    symmetry: int
+    inflation: float
     pose: Array
     covariance: Array
 
@@ -163,9 +168,7 @@ class HeldObjectFinder:
         settings: The settings.
     """
 
-    def __init__(
-        self, robot: Robot, attached: Sequence[AttachedObject], settings: HeldSettings | None = None
-    ) -> None:
+    def __init__(self, robot: Robot, attached: Sequence[AttachedObject], settings: HeldSettings | None = None) -> None:
         """Prepare the surfaces of robot and objects.
 
         Raises:
@@ -177,19 +180,20 @@ class HeldObjectFinder:
         self._robot = RobotSurface(robot)
         self._surfaces = [body_surface(one) for one in self.attached]
         self._ties = [_ties(one, surface) for one, surface in zip(self.attached, self._surfaces, strict=True)]
-        self._factors = [CALIBRATION[_shape_of(one, it)] for one, it in zip(self.attached, self._surfaces, strict=True)]
-        self._flat: dict[str, Indices | None] = {}
+        pairs = list(zip(self.attached, self._surfaces, strict=True))
+        self._symmetries = [_symmetry(one, surface) for one, surface in pairs]
+        self._inflations = [INFLATION[_shape_of(one, surface)] for one, surface in pairs]
 
     def expected(self, state: Array) -> list[Expected]:
         """Return the objects as their grasps have them in a state, shape (dof,)."""
         s = self.settings
         spread = np.diag([*np.radians(s.grasp_turn), *s.grasp_shift]) ** 2
         found = []
-        for body, surface, ties, factor in zip(
-            self.attached, self._surfaces, self._ties, self._factors, strict=True
+        for body, *about in zip(
+            self.attached, self._surfaces, self._ties, self._symmetries, self._inflations, strict=True
         ):
             link = self.robot.link_pose(state, body.link)
-            found.append(Expected(body, surface, ties, factor, link @ body.pose, turned(spread, link[:3, :3])))
+            found.append(Expected(body, *about, link @ body.pose, turned(spread, link[:3, :3])))
         return found
 
     def by_grasp(self, frame: Frame) -> tuple[HeldObject, ...]:
@@ -210,39 +214,22 @@ class HeldObjectFinder:
         Raises:
             ApexError: The frame has no position of a joint, or its camera is on a link that does not exist.
         """
-        camera, state = frame.camera, frame.state(self.robot.joint_names)
-        noise = camera.depth.noise / np.sqrt(frames)
-        measured = self._measured(frame)
-        pose = camera.pose_at(self.robot, state)
-        s = self.settings.registration
-        if s is None:
-            spreads = [camera.angle_spread] * 3 + [camera.position_spread] * 3 + [camera.depth.scale_spread]
-            corrected = Registration(pose, 1.0, state, np.diag(spreads) ** 2, 0)
-        else:
-            corrected = register(measured, camera, pose, self._robot, state, s, noise)
-        measured *= corrected.scale
-        poses = self._robot.poses(corrected.state)
-        thin = self._robot.seen_from(corrected.pose, poses)
-        thick = self._robot.seen_from(corrected.pose, poses, self.settings.thickness)
-        return tuple(
-            self._find_one(one, measured, camera, corrected, thin, thick, noise) for one in self.expected(state)
-        )
+        return self.find_in(corrected(frame, self._robot, self.settings.registration, frames))
 
-    def _measured(self, frame: Frame) -> Array:
-        """Return the depths of a pinhole in meters, 0 where there are none, as a new array."""
-        camera = frame.camera
-        key = camera.model_dump_json(include={"width", "height", "focal", "center", "distortion"})
-        if key not in self._flat:
-            self._flat[key] = undistorted(camera)
-        depth = resampled(frame.depth, self._flat[key]) * camera.depth.scale
-        return np.where(depth >= camera.depth.nearest, depth, 0.0)
+    def find_in(self, seen: CorrectedFrame) -> tuple[HeldObject, ...]:
+        """Return where the objects are in a frame that is corrected already, in the order of ``attached``."""
+        found = seen.registration
+        poses = self._robot.poses(found.state)
+        thin = self._robot.seen_from(found.pose, poses)
+        thick = self._robot.seen_from(found.pose, poses, self.settings.thickness)
+        return tuple(self._find_one(one, seen, thin, thick) for one in self.expected(found.state))
 
     def _find_one(
-        self, one: Expected, measured: Array, camera: Camera, corrected: Registration, thin: Array, thick: Array,
-        noise: float,
+        self, one: Expected, seen: CorrectedFrame, thin: Array, thick: Array
     ) -> HeldObject:  # fmt: skip
+        camera, measured, registration, noise = seen
         s, lens = self.settings, lens_of(camera)
-        expected = inverse(corrected.pose) @ one.pose
+        expected = inverse(registration.pose) @ one.pose
         center = expected[:3, 3]
         shift = 2.5 * max(s.grasp_shift)
         radius = one.surface.radius * (1.0 + 2.0 * s.size_spread) + shift
@@ -254,7 +241,8 @@ class HeldObjectFinder:
             return _without(one, f"{one.body.name!r} is {center[2]:.2f} m away, out of the range {low:g} to {high:g} m")
         own = window.lens(lens)
         robot, near_robot = (
-            draw_triangles(vertices, self._robot.faces, own, window.height, window.width)[0] for vertices in (thin, thick)
+            draw_triangles(vertices, self._robot.faces, own, window.height, window.width)[0]
+            for vertices in (thin, thick)
         )
         points, beyond = select_points(
             measured, robot, near_robot, window, lens, center, radius, 2.0 * noise, s.thickness
@@ -263,32 +251,35 @@ class HeldObjectFinder:
         if count < s.least_points:
             return _without(one, _nothing_seen(one, measured, window, robot, center, radius), count)
         kept = points[np.linspace(0, len(points) - 1, min(len(points), s.most_points)).astype(np.int64)]
-        settings = self._fit_settings(camera, window, len(points) / len(kept), noise)
-        prior = np.linalg.inv(turned(one.covariance, corrected.pose[:3, :3].T))
+        settings = self._fit_settings(one, camera, window, len(points) / len(kept), noise)
+        prior = np.linalg.inv(turned(one.covariance, registration.pose[:3, :3].T))
         if s.size_spread > 0.0:
             sizes = np.where(np.isin(range(3), one.ties), s.size_spread**-2, UNKNOWN)
             prior = np.block([[prior, np.zeros((6, 3))], [np.zeros((3, 6)), np.diag(sizes)]])
         fits = [
-            fit_surface(kept, beyond, own, one.surface.vertices, one.surface.faces, one.ties, start, expected, prior,
+            fit_surface(kept, beyond, own, one.surface.vertices, one.surface.faces, one.ties, one.symmetry, start, expected, prior,
                         settings)
-            for start in self._starts(one, expected, corrected)
+            for start in self._starts(one, expected, registration)
         ]  # fmt: skip
-        return self._answer(one, fits, beyond, measured, window, corrected, count)
+        return self._answer(one, fits, beyond, measured, window, registration, count)
 
-    def _fit_settings(self, camera: Camera, window: Window, thinning: float, noise: float) -> FitSettings:
+    def _fit_settings(
+        self, one: Expected, camera: Camera, window: Window, thinning: float, noise: float
+    ) -> FitSettings:  # fmt: skip
         """Return the weights of points that stand for others, of pixels that share their noise in patches."""
         s = self.settings
         patch = (camera.depth.correlation / window.stride) ** 2
-        share = s.point_share * thinning / max(1.0, patch)
+        share = s.point_share * thinning / max(1.0, patch) / one.inflation
+        contour_share = s.contour_share * window.stride / one.inflation
         return FitSettings(
-            noise=noise, floor=s.floor, edge=s.edge, point_share=share, contour_share=s.contour_share * window.stride,
+            noise=noise, floor=s.floor, edge=s.edge, point_share=share, contour_share=contour_share,
             first=0.03, last=0.018, reach=0.02, steps=8,
         )  # fmt: skip
 
-    def _starts(self, one: Expected, expected: Array, corrected: Registration) -> list[Array]:
+    def _starts(self, one: Expected, expected: Array, registration: Registration) -> list[Array]:
         """Return the poses to start from, in the optical frame: turned about the axis about which grasps vary most."""
         values, vectors = np.linalg.eigh(one.covariance[:3, :3])
-        axis = corrected.pose[:3, :3].T @ vectors[:, int(np.argmax(values))]
+        axis = registration.pose[:3, :3].T @ vectors[:, int(np.argmax(values))]
         starts = []
         for degrees in self.settings.starts:
             start = expected.copy()
@@ -298,7 +289,7 @@ class HeldObjectFinder:
 
     def _answer(
         self, one: Expected, fits: list[SurfaceFit], beyond: Array, measured: Array, window: Window,
-        corrected: Registration, count: int,
+        registration: Registration, count: int,
     ) -> HeldObject:  # fmt: skip
         best = min(fits, key=lambda fit: fit.cost)
         if not np.isfinite(best.cost):
@@ -313,7 +304,7 @@ class HeldObjectFinder:
             away = np.zeros(n)
             away[:3] = pin.log3(fit.rotation @ best.rotation.T)
             away[3:6] = fit.position - best.position
-            covariance += weight * (own + lever @ corrected.covariance @ lever.T + np.outer(away, away))
+            covariance += weight * (own + lever @ registration.covariance @ lever.T + np.outer(away, away))
         pose, scale = np.eye(4), best.scale
         pose[:3, :3], pose[:3, 3] = best.rotation, best.position
         seen, missed = _measured_shares(best, measured, window)
@@ -321,10 +312,9 @@ class HeldObjectFinder:
             return _without(one, f"{one.body.name!r}: no surface is seen where the hand holds it", count)
         if seen < self.settings.least_seen:
             return _without(one, f"{one.body.name!r} is hidden: {100 * seen:.0f} % of it can be seen", count)
-        covariance *= one.factor
-        world = turned(covariance[:6, :6], corrected.pose[:3, :3])
+        world = turned(covariance[:6, :6], registration.pose[:3, :3])
         size = np.sqrt(np.diag(covariance)[6:][one.ties]) if n > 6 else np.zeros(3)
-        return _described(one.body, "", corrected.pose @ pose, scale, world, size, seen, count, best.cost)
+        return _described(one.body, "", registration.pose @ pose, scale, world, size, seen, count, best.cost)
 
 
 def turned(covariance: Array, rotation: Array) -> Array:
@@ -368,7 +358,8 @@ def _nothing_seen(
 ) -> str:  # fmt: skip
     """Return why there are no points of an object, as a sentence."""
     part = measured[
-        window.top : window.top + window.height * window.stride, window.left : window.left + window.width * window.stride
+        window.top : window.top + window.height * window.stride,
+        window.left : window.left + window.width * window.stride,
     ]
     name = repr(one.body.name)
     if np.mean(part > 0.0) < 0.3:
@@ -411,9 +402,22 @@ def _ties(body: AttachedObject, surface: Surface) -> Indices:
     return np.array([0, 0, 2]) if abs(sides[0] - sides[1]) < 1e-3 * sides[0] else np.array([0, 1, 2])
 
 
+def _symmetry(body: AttachedObject, surface: Surface) -> int:
+    """Return ``AXIS`` for a body of revolution about its z, whose vertices lie on rings, ``BALL`` or 0."""
+    if body.sphere is not None:
+        return BALL
+    if body.box is not None:
+        return 0
+    radii = np.hypot(surface.vertices[:, 0], surface.vertices[:, 1])
+    rings = np.round(np.stack([radii, surface.vertices[:, 2]], axis=1) / (ROUND * surface.radius))
+    _, owner, count = np.unique(rings, axis=0, return_inverse=True, return_counts=True)
+    small = radii < ROUND * surface.radius
+    return AXIS if (small | (count[owner.ravel()] >= LEAST_RING)).all() else 0
+
+
 def _shape_of(body: AttachedObject, surface: Surface) -> str:
-    """Return the key of a body in ``CALIBRATION``."""
-    if body.shape in CALIBRATION and body.mesh is None:
+    """Return the key of a body in ``INFLATION``."""
+    if body.shape in INFLATION and body.mesh is None:
         return body.shape
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     return "thin mesh" if abs(mesh.volume) < THIN * mesh.convex_hull.volume else "mesh"

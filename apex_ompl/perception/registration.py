@@ -11,7 +11,8 @@ import pinocchio as pin
 
 from apex_ompl.kernel.perception import POSE, Drawn, draw_triangles, register_rows
 from apex_ompl.perception.camera import Camera
-from apex_ompl.perception.rendering import lens_of
+from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.rendering import lens_of, resampled, undistorted
 from apex_ompl.perception.surfaces import RobotSurface
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_positive, finite_numbers
@@ -32,7 +33,7 @@ class RegistrationSettings:
     """
 
     joint_spreads: Mapping[str, float] | None = None
-    floor: float = 0.001
+    floor: float = 0.0005
     share: float = 1.0
 
     def __post_init__(self) -> None:
@@ -121,3 +122,45 @@ def register(
     found[:3, :3] = pose[:3, :3] @ pin.exp3(unknowns[:3])
     found[:3, 3] = pose[:3, 3] + pose[:3, :3] @ unknowns[3:6]
     return Registration(found, 1.0 + float(unknowns[6]), corrected, covariance[:POSE, :POSE], count)
+
+
+class CorrectedFrame(NamedTuple):
+    """Depths of a pinhole with the corrections of a registration.
+
+    Attributes:
+        camera: The camera.
+        depth: Depths, 0 where there is none, shape (height, width) [m].
+        registration: The corrections.
+        noise: Standard deviation of depth z is ``noise`` z^2 [1/m].
+    """
+
+    camera: Camera
+    depth: Array
+    registration: Registration
+    noise: float
+
+
+def corrected(
+    frame: Frame, surface: RobotSurface, settings: RegistrationSettings | None, frames: int = 1
+) -> CorrectedFrame:
+    """Return the depths of a frame, corrected by the robot's surface.
+
+    Args:
+        frame: The frame.
+        surface: The robot's surface.
+        settings: Settings, or None to leave the camera as it is.
+        frames: Number of frames whose depths it has the mean of.
+
+    Raises:
+        ApexError: The frame has no position of a joint, or its camera is on a link that does not exist.
+    """
+    camera, state = frame.camera, frame.state(surface.robot.joint_names)
+    noise = camera.depth.noise / float(np.sqrt(frames))
+    depth = resampled(frame.depth, undistorted(camera)) * camera.depth.scale
+    depth = np.where(depth >= camera.depth.nearest, depth, 0.0)
+    pose = camera.pose_at(surface.robot, state)
+    if settings is None:
+        spreads = [camera.angle_spread] * 3 + [camera.position_spread] * 3 + [camera.depth.scale_spread]
+        return CorrectedFrame(camera, depth, Registration(pose, 1.0, state, np.diag(spreads) ** 2, 0), noise)
+    found = register(depth, camera, pose, surface, state, settings, noise)
+    return CorrectedFrame(camera, depth * found.scale, found, noise)

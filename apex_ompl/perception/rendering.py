@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import coal
@@ -84,7 +85,13 @@ def undistorted(camera: Camera) -> Indices | None:
     """
     if not any(camera.distortion):
         return None
-    rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
+    return _undistorted(camera.width, camera.height, camera.focal, camera.center, camera.distortion)
+
+
+@lru_cache(maxsize=4)
+def _undistorted(width: int, height: int, focal: Any, center: Any, distortion: Any) -> Indices:
+    camera = Camera(width=width, height=height, focal=focal, center=center, distortion=distortion)
+    rows, columns = np.mgrid[0:height, 0:width]
     lens = lens_of(camera)
     rays = np.stack([(columns - lens[2]) / lens[0], (rows - lens[3]) / lens[1], np.ones(rows.shape)], axis=-1)
     return _flat(camera.project(rays), camera)
@@ -123,7 +130,9 @@ class ZBuffer:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         there = index >= 0
         view = View(
-            np.where(there, depth, 0.0), np.where(there, labels[index], 0), np.where(there[..., None], normals[index], 0.0)
+            np.where(there, depth, 0.0),
+            np.where(there, labels[index], 0),
+            np.where(there[..., None], normals[index], 0.0),
         )
         return _seen_through(camera, view)
 
@@ -183,7 +192,10 @@ class Mujoco:
         geom.meshname = str(k)
         vertices, faces = part.surface
         spec.add_mesh(
-            name=str(k), uservert=vertices.ravel(), userface=faces.ravel(), inertia=self._mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+            name=str(k),
+            uservert=vertices.ravel(),
+            userface=faces.ravel(),
+            inertia=self._mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
         )
 
     def _place(self, spec: Any, camera: Camera, pose: Array) -> None:
@@ -361,4 +373,3 @@ def seen_share(label: int, view: View, alone: View) -> float:
     """Return the share of a body's outline that is seen, from its view among other bodies and from that of it alone."""
     whole = np.count_nonzero(alone.depth > 0.0)
     return float(np.count_nonzero(view.labels == label) / whole) if whole else 0.0
-

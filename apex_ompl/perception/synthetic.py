@@ -205,7 +205,9 @@ class SceneGenerator:
         self.robot, self.renderer, self._camera = robot, renderer or ZBuffer(), camera
         self._meshes = meshes
         self._surface = RobotSurface(robot, LINK_SLICES)
-        self._links = [geometry_surface(item.geometry, item.name, LINK_SLICES) for item in robot.geometry.geometryObjects]
+        self._links = [
+            geometry_surface(item.geometry, item.name, LINK_SLICES) for item in robot.geometry.geometryObjects
+        ]
         rng = np.random.default_rng(5)
         shades = rng.uniform(0.55, 0.95, (len(self._surface.links), 1)) * np.ones(3)
         self._shades = [(float(r), float(g), float(b)) for r, g, b in shades]
@@ -243,9 +245,7 @@ class SceneGenerator:
             )
             for t in range(given.frames)
         )  # fmt: skip
-        objects = tuple(
-            self._truth(one, HELD + k, view, camera, pose, there[k]) for k, one in enumerate(held)
-        )
+        objects = tuple(self._truth(one, HELD + k, view, camera, pose, there[k]) for k, one in enumerate(held))
         return SyntheticScene(frames, objects, pose, true_state, view.labels)
 
     def _state(self, rng: np.random.Generator) -> Array:

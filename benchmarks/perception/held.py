@@ -166,7 +166,9 @@ def covariance_rows(all_samples: Sequence[Sample]) -> list[list[Any]]:
     rows = []
     for method in METHODS:
         for kind in sorted({one.kind for one in all_samples}):
-            squared = np.array([s.squared for s in all_samples if s.method == method and s.kind == kind and not s.reason])
+            squared = np.array(
+                [s.squared for s in all_samples if s.method == method and s.kind == kind and not s.reason]
+            )
             low, high = band(len(squared))
             share = float(np.mean(squared < CHI_SQUARED))
             slack = 1.96 * np.sqrt(0.05 * 0.95 / len(squared))

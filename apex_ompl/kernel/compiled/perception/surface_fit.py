@@ -16,7 +16,7 @@ from apex_ompl.kernel.compiled.perception.rasterizer import draw
 from apex_ompl.kernel.compiled.perception.registration import unit_normal
 
 CAMERA = 7  # turn, shift, scale of depth
-MOST = 9  # unknowns
+AXIS, BALL = 1, 2  # symmetries: of a body of revolution about its z, and of a ball
 REACH = 8  # pixels beside a drawing within which points belong to it
 DIAGONAL = math.sqrt(2.0)
 LARGEST_TURN = 0.3  # of a step [rad]
@@ -166,12 +166,21 @@ def _add(matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Flo
 
 @inlined
 def _surface_row(
-    row: Floats, rotation: Floats, position: Floats, ties: Integers, x: float, y: float, z: float, gx: float, gy: float,
-    gz: float,
+    row: Floats, rotation: Floats, position: Floats, ties: Integers, symmetry: int, x: float, y: float, z: float,
+    gx: float, gy: float, gz: float,
 ) -> None:  # fmt: skip
-    """Set the derivatives of a residual whose derivative by the surface point (x, y, z) is g."""
+    """Set the derivatives of a residual whose derivative by the surface point (x, y, z) is g.
+
+    Turns that leave the body as it is have none, though the facets of a round surface would give some.
+    """
     ex, ey, ez = x - position[0], y - position[1], z - position[2]
     row[0], row[1], row[2] = ey * gz - ez * gy, ez * gx - ex * gz, ex * gy - ey * gx
+    if symmetry == AXIS:
+        about = row[0] * rotation[0, 2] + row[1] * rotation[1, 2] + row[2] * rotation[2, 2]
+        for k in range(3):
+            row[k] -= about * rotation[k, 2]
+    elif symmetry == BALL:
+        row[0], row[1], row[2] = 0.0, 0.0, 0.0
     row[3], row[4], row[5] = gx, gy, gz
     if len(row) > 6:
         row[6], row[7], row[8] = 0.0, 0.0, 0.0
@@ -230,8 +239,9 @@ def _robust(residual: float, limit: float) -> tuple[float, float]:
 
 @entry_point
 def fit_surface(
-    points: Floats, beyond: Floats, lens: Floats, vertices: Floats, faces: Integers, ties: Integers,
-    rotation: Floats, position: Floats, scale: Floats, prior_rotation: Floats, prior_position: Floats, prior: Floats,
+    points: Floats, outline: int, beyond: Floats, lens: Floats, vertices: Floats, faces: Integers, ties: Integers,
+    symmetry: int, rotation: Floats, position: Floats, scale: Floats, prior_rotation: Floats, prior_position: Floats,
+    prior: Floats,
     settings: tuple[float, float, float, float, float, float, float, float], steps: int,
     placed: Floats, depth: Floats, index: Integers, matrix: Floats, factor: Floats, vector: Floats, cross: Floats,
     row: Floats, camera: Floats,
@@ -240,11 +250,14 @@ def fit_surface(
 
     Args:
         points: Measured points in the optical frame, shape (N, 3) [m].
+        outline: Points from this one on have the object's color but a depth that is guessed: they have to be inside the
+            outline.
         beyond: Distances of pixels from what the object may cover, shape (h, w) [pixels].
         lens: Focal lengths and principal point of that window, shape (4,) [pixels].
         vertices: In the frame of the object, shape (V, 3) [m].
         faces: Triangles, shape (F, 3).
         ties: Unknown of the scale along each axis, 0 to 2, shape (3,).
+        symmetry: ``AXIS``, ``BALL``, or 0 for none.
         rotation: Rotation of the object in the optical frame, at the start and at the end, shape (3, 3).
         position: Its origin there, shape (3,) [m].
         scale: Its scales, shape (3,).
@@ -292,10 +305,13 @@ def fit_surface(
             inside = 0 <= line < height and 0 <= column < width
             k = index[line, column] if inside else -1
             seen = k >= 0
+            if seen and p >= outline:
+                continue
+            share, largest = (point_share, cutoff) if p < outline else (contour_share, max(cutoff, reach))
             if inside and not seen:
                 k = _seen_beside(index, line, column)
             if k < 0:
-                cost += point_share / 3.0 * (last / (noise * z * z + floor)) ** 2
+                cost += share / 3.0 * (last / (noise * z * z + floor)) ** 2
                 continue
             a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
             if seen:
@@ -313,14 +329,14 @@ def fit_surface(
             across = edge * z / lens[0]
             variance = noise * noise * z * z * z * z * cosine * cosine + floor * floor
             variance += across * across * (1.0 - cosine * cosine)
-            weight, loss = _robust(r, cutoff)
-            cost += point_share * loss * cutoff * cutoff / variance
+            weight, loss = _robust(r, largest)
+            cost += share * loss * largest * largest / variance
             if weight == 0.0:
                 continue
-            _surface_row(row, rotation, position, ties, x - r * nx, y - r * ny, z - r * nz, -nx, -ny, -nz)
+            _surface_row(row, rotation, position, ties, symmetry, x - r * nx, y - r * ny, z - r * nz, -nx, -ny, -nz)
             camera[0], camera[1], camera[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
             camera[3], camera[4], camera[5], camera[6] = nx, ny, nz, nx * x + ny * y + nz * z
-            _add(matrix, vector, cross, row, camera, point_share * weight / variance, r)
+            _add(matrix, vector, cross, row, camera, share * weight / variance, r)
         for i in range(1, height - 1):
             for j in range(1, width - 1):
                 if index[i, j] < 0 or beyond[i, j] == 0.0:
@@ -340,7 +356,7 @@ def fit_surface(
                 if weight == 0.0:
                     continue
                 gz = -(gu * x + gv * y) / z
-                _surface_row(row, rotation, position, ties, x, y, z, gu, gv, gz)
+                _surface_row(row, rotation, position, ties, symmetry, x, y, z, gu, gv, gz)
                 camera[0], camera[1], camera[2] = -(y * gz - z * gv), -(z * gu - x * gz), -(x * gv - y * gu)
                 camera[3], camera[4], camera[5], camera[6] = -gu, -gv, -gz, 0.0
                 _add(matrix, vector, cross, row, camera, contour_share * weight / variance, r)
@@ -353,12 +369,12 @@ def fit_surface(
         if not _solve(factor, vector):
             return math.inf
         angle = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
-        share = min(1.0, LARGEST_TURN / max(angle, 1e-12))
-        _turn(rotation, share * vector[0], share * vector[1], share * vector[2])
+        length = min(1.0, LARGEST_TURN / max(angle, 1e-12))
+        _turn(rotation, length * vector[0], length * vector[1], length * vector[2])
         for k in range(3):
-            position[k] += share * vector[3 + k]
+            position[k] += length * vector[3 + k]
             if n > 6:
-                scale[k] *= math.exp(share * vector[6 + ties[k]])
+                scale[k] *= math.exp(length * vector[6 + ties[k]])
     return cost
 
 
