@@ -27,10 +27,11 @@ from apex_ompl.util.validation import check_number
 
 SLICES, LINK_SLICES = 96, 32  # of round surfaces
 PALM = -0.009  # surface of the palm in its frame, along z [m]
-BACKGROUND, TABLES, CLUTTER, LINKS, HELD = 1, 3, 4, 10, 200  # first labels
+BACKGROUND, TABLES, CLUTTER, LINKS, OBSTACLE, HELD = 1, 3, 4, 10, 190, 200  # first labels
 GRASP_SHIFT = (0.008, 0.008, 0.003)  # standard deviations along the axes of the palm [m]
 GRASP_TURN = (4.0, 4.0, 10.0)  # about them [degrees]
 LEAST_HEIGHT, LEAST_DISTANCE = 0.15, 0.4  # of the palms above the tables and from each other [m]
+RED_SHARE = 0.4  # of the clutter, where some of it is red
 SPREAD = 0.35  # of the joints around the home state [rad]
 
 
@@ -106,6 +107,8 @@ class SyntheticSettings:
         frames: Number of frames with noise of their own, the robot standing still.
         colors: Whether frames have colors.
         empty: Probability that a hand is empty though an object is reported.
+        obstacle: Kind of a red obstacle before the robot, or None; half of them stand upright.
+        reds: Whether some of the clutter is red, too.
         sensor: Noise of depths.
     """
 
@@ -118,6 +121,8 @@ class SyntheticSettings:
     frames: int = 1
     colors: bool = False
     empty: float = 0.0
+    obstacle: Literal["cube", "box", "cylinder"] | None = None
+    reds: bool = False
     sensor: DepthSensor = field(default_factory=DepthSensor)
 
     def __post_init__(self) -> None:
@@ -160,6 +165,23 @@ class TrueObject:
 
 
 @dataclass(frozen=True, eq=False)
+class TrueObstacle:
+    """An obstacle.
+
+    Attributes:
+        kind: Its kind.
+        size: Lengths along its axes, of a cylinder diameter, diameter and length, shape (3,) [m].
+        pose: Its pose in the world, shape (4, 4) [m].
+        seen: Share of its outline that is not hidden, by what is before it or by the image's border.
+    """
+
+    kind: str
+    size: Array
+    pose: Array
+    seen: float
+
+
+@dataclass(frozen=True, eq=False)
 class SyntheticScene:
     """Frames with the truth.
 
@@ -169,6 +191,7 @@ class SyntheticScene:
         camera: True pose of the camera in the world, shape (4, 4) [m].
         state: True state of the robot, shape (dof,).
         labels: Labels of the parts seen: held objects from ``HELD`` on, links from ``LINKS`` on, shape (height, width).
+        obstacle: The red obstacle, or None.
     """
 
     frames: tuple[Frame, ...]
@@ -176,6 +199,7 @@ class SyntheticScene:
     camera: Array
     state: Array
     labels: Indices
+    obstacle: TrueObstacle | None
 
 
 def default_camera(settings: SyntheticSettings) -> Camera:
@@ -229,7 +253,10 @@ class SceneGenerator:
         reported_pose = pose @ random_error(rng, given.camera_shift, given.camera_turn)
         camera = (self._camera or default_camera(given)).placed(reported_pose)
         there = [rng.random() >= given.empty for _ in held]
-        parts = self._parts(rng, true_state)
+        parts = self._parts(rng, true_state, given.reds)
+        solid = None if given.obstacle is None else _obstacle(rng, given.obstacle, middle)
+        if solid is not None:
+            parts.append(solid_part(solid[0], solid[1], OBSTACLE, _red(rng)))
         for k, (_, body, *_, at, _) in enumerate(held):
             if there[k]:
                 parts.append(solid_part(coal_geometry(body), at, HELD + k, _color(rng)))
@@ -246,7 +273,25 @@ class SceneGenerator:
             for t in range(given.frames)
         )  # fmt: skip
         objects = tuple(self._truth(one, HELD + k, view, camera, pose, there[k]) for k, one in enumerate(held))
-        return SyntheticScene(frames, objects, pose, true_state, view.labels)
+        obstacle = None
+        if given.obstacle is not None and solid is not None:
+            whole = self._outline(solid[0], solid[1], camera, pose)
+            share = float(np.count_nonzero(view.labels == OBSTACLE) / max(whole, 1))
+            obstacle = TrueObstacle(given.obstacle, solid[2], solid[1], share)
+        return SyntheticScene(frames, objects, pose, true_state, view.labels, obstacle)
+
+    @staticmethod
+    def _outline(solid: coal.CollisionGeometry, at: Array, camera: Camera, pose: Array) -> int:
+        """Return the number of pixels of a solid's outline in an image three times as wide and high."""
+        wide = camera.model_copy(
+            update={
+                "width": 3 * camera.width,
+                "height": 3 * camera.height,
+                "center": (camera.center[0] + camera.width, camera.center[1] + camera.height),
+            }
+        )
+        view = ZBuffer().draw([solid_part(solid, at, OBSTACLE, (1.0, 0.0, 0.0))], wide, pose)
+        return int(np.count_nonzero(view.depth))
 
     def _state(self, rng: np.random.Generator) -> Array:
         robot = self.robot
@@ -290,7 +335,7 @@ class SceneGenerator:
         eye = middle + rng.uniform(1.0, 1.5) * np.array([*flat, np.sin(elevation)])
         return look_at(eye, middle + rng.normal(0.0, 0.05, 3), float(np.radians(rng.normal(0.0, 3.0))))
 
-    def _parts(self, rng: np.random.Generator, state: Array) -> list[Part]:
+    def _parts(self, rng: np.random.Generator, state: Array, reds: bool) -> list[Part]:
         """Return the robot, its tables with clutter, a wall and the floor."""
         poses = self._surface.poses(state)
         items = self.robot.geometry.geometryObjects
@@ -313,7 +358,8 @@ class SceneGenerator:
             at = np.eye(4)
             at[:3, :3] = pin.Quaternion(_unit(rng.normal(size=4))).matrix()
             at[:3, 3] = rng.uniform(-0.2, 0.8), rng.uniform(-0.9, 0.9), 0.05
-            parts.append(solid_part(shape, at, CLUTTER + k % 6, _color(rng)))
+            color = _red(rng) if reds and rng.random() < RED_SHARE else _color(rng)
+            parts.append(solid_part(shape, at, CLUTTER + k % 6, color))
         return parts
 
     def _truth(
@@ -363,6 +409,33 @@ def _rotation(axis: str, degrees: float) -> Array:
     return found
 
 
+def _obstacle(
+    rng: np.random.Generator, kind: str, middle: Array
+) -> tuple[coal.CollisionGeometry, Array, Array]:  # fmt: skip
+    """Return a solid before the hands, whose middle is given, its pose, and its lengths."""
+    size = np.full(3, rng.uniform(0.06, 0.25))
+    if kind == "box":
+        size = rng.uniform(0.06, 0.25, 3)
+    solid: coal.CollisionGeometry = coal.Box(*size)
+    if kind == "cylinder":
+        size = np.array([1.0, 1.0, 0.0]) * rng.uniform(0.06, 0.2) + (0.0, 0.0, rng.uniform(0.08, 0.3))
+        solid = coal.Cylinder(size[0] / 2.0, size[2])
+    at = np.eye(4)
+    at[:3, :3] = pin.exp3(np.array([0.0, 0.0, rng.uniform(0.0, np.pi)]))
+    if rng.random() < 0.5:
+        at[:3, :3] = pin.Quaternion(_unit(rng.normal(size=4))).matrix()
+    at[:3, 3] = middle + rng.uniform((-0.1, -0.3, -0.15), (0.25, 0.3, 0.25))
+    return solid, at, size
+
+
+def _red(rng: np.random.Generator) -> tuple[float, float, float]:
+    r, low = rng.uniform(0.55, 0.9), rng.uniform(0.03, 0.12)
+    return float(r), float(low), float(low)
+
+
 def _color(rng: np.random.Generator) -> tuple[float, float, float]:
-    r, g, b = rng.uniform(0.1, 0.95, 3)
-    return float(r), float(g), float(b)
+    """Return a random color that is not red."""
+    while True:
+        r, g, b = rng.uniform(0.1, 0.95, 3)
+        if r < 1.6 * max(g, b):
+            return float(r), float(g), float(b)
