@@ -37,7 +37,7 @@ from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
-INFLATION = {"box": 1.0, "cylinder": 1.0, "capsule": 1.0, "sphere": 1.0, "mesh": 1.0, "thin mesh": 1.0}
+INFLATION = {"box": 1.2, "cylinder": 0.9, "capsule": 0.9, "sphere": 1.0, "mesh": 1.2, "thin mesh": 1.05}
 """Factors of the variances of measurements by shape: mean squared normalized errors over their number of dimensions.
 
 They are those of ``python -m benchmarks.perception.held --calibrate``, on scenes of their own. Walls that are thin may be
@@ -45,6 +45,7 @@ taken for one another.
 """
 THIN = 0.5  # share of the volume of its hull below which a mesh is thin
 ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in which they agree, and their least number
+MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
@@ -68,6 +69,7 @@ class HeldSettings:
         most_points: Points that are used at most.
         least_points: Pixels without which there is no answer.
         least_seen: Share of the expected outline without which there is no answer.
+        most_misfit: Mean squared error of points over that of noise above which there is no answer.
     """
 
     grasp_shift: tuple[float, float, float] = (0.008, 0.008, 0.003)
@@ -82,7 +84,8 @@ class HeldSettings:
     starts: tuple[float, ...] = (0.0, -18.0, 18.0)
     most_points: int = 300
     least_points: int = 60
-    least_seen: float = 0.1
+    least_seen: float = 0.2
+    most_misfit: float = 12.0
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -93,7 +96,16 @@ class HeldSettings:
         for name in ("grasp_shift", "grasp_turn"):
             for value in getattr(self, name):
                 check_positive(value, name)
-        for name in ("thickness", "floor", "edge", "point_share", "contour_share", "most_points", "least_points"):
+        for name in (
+            "thickness",
+            "floor",
+            "edge",
+            "point_share",
+            "contour_share",
+            "most_points",
+            "least_points",
+            "most_misfit",
+        ):
             check_positive(getattr(self, name), name)
         check_number(self.size_spread, "size_spread", 0.0, 1.0)
         check_number(self.least_seen, "least_seen", 0.0, 1.0)
@@ -119,7 +131,7 @@ class HeldObject:
         axis_spread: Standard deviation of the axis, root of the sum over both directions [rad].
         seen: Share of the object's outline that was measured.
         points: Number of pixels that may be the object's.
-        cost: Robust sum of squared errors.
+        misfit: Mean robust squared error of its points over what noise explains; infinite without an answer.
     """
 
     name: str
@@ -134,7 +146,7 @@ class HeldObject:
     axis_spread: float
     seen: float
     points: int
-    cost: float
+    misfit: float
 
 
 class Expected(NamedTuple):
@@ -261,7 +273,8 @@ class HeldObjectFinder:
                         settings)
             for start in self._starts(one, expected, registration)
         ]  # fmt: skip
-        return self._answer(one, fits, beyond, measured, window, registration, count)
+        misfit = min(fit.cost for fit in fits) / (settings.point_share * len(kept))
+        return self._answer(one, fits, prior, misfit, measured, window, registration, count)
 
     def _fit_settings(
         self, one: Expected, camera: Camera, window: Window, thinning: float, noise: float
@@ -288,19 +301,22 @@ class HeldObjectFinder:
         return starts
 
     def _answer(
-        self, one: Expected, fits: list[SurfaceFit], beyond: Array, measured: Array, window: Window,
+        self, one: Expected, fits: list[SurfaceFit], prior: Array, misfit: float, measured: Array, window: Window,
         registration: Registration, count: int,
     ) -> HeldObject:  # fmt: skip
         best = min(fits, key=lambda fit: fit.cost)
         if not np.isfinite(best.cost):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
+        if misfit > self.settings.most_misfit:
+            return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
+        factor = max(1.0, misfit / MISFIT)  # of the variances of measurements, as Birge's ratio (1932)
         covariance, n = np.zeros_like(best.information), len(best.information)
         weights = np.exp(-0.5 * np.array([fit.cost - best.cost for fit in fits]))
         for fit, weight in zip(fits, weights / weights.sum(), strict=True):
             if weight < 1e-3:
                 continue
-            own = np.linalg.inv(fit.information)
-            lever = own @ fit.cross
+            own = np.linalg.inv(prior + (fit.information - prior) / factor)
+            lever = own @ fit.cross / factor
             away = np.zeros(n)
             away[:3] = pin.log3(fit.rotation @ best.rotation.T)
             away[3:6] = fit.position - best.position
@@ -314,7 +330,7 @@ class HeldObjectFinder:
             return _without(one, f"{one.body.name!r} is hidden: {100 * seen:.0f} % of it can be seen", count)
         world = turned(covariance[:6, :6], registration.pose[:3, :3])
         size = np.sqrt(np.diag(covariance)[6:][one.ties]) if n > 6 else np.zeros(3)
-        return _described(one.body, "", registration.pose @ pose, scale, world, size, seen, count, best.cost)
+        return _described(one.body, "", registration.pose @ pose, scale, world, size, seen, count, misfit)
 
 
 def turned(covariance: Array, rotation: Array) -> Array:
@@ -375,7 +391,7 @@ def _without(one: Expected, reason: str, count: int = 0) -> HeldObject:
 
 def _described(
     body: AttachedObject, reason: str, pose: Array, scale: Array, covariance: Array, size_spread: Array, seen: float,
-    points: int, cost: float,
+    points: int, misfit: float,
 ) -> HeldObject:  # fmt: skip
     """Return the answer with its contact face."""
     contact = body.contact
@@ -388,7 +404,7 @@ def _described(
     turn = pin.skew(axis)
     return HeldObject(
         body.name, reason, pose, scale, covariance, size_spread, pose[:3, 3] + arm, axis,
-        float(np.sqrt(np.trace(face))), float(np.sqrt(np.trace(turn @ covariance[:3, :3] @ turn.T))), seen, points, cost,
+        float(np.sqrt(np.trace(face))), float(np.sqrt(np.trace(turn @ covariance[:3, :3] @ turn.T))), seen, points, misfit,
     )  # fmt: skip
 
 
