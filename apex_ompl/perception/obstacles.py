@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -212,27 +213,26 @@ class ObstacleFinder:
 
     def colored(self, image: NDArray[np.uint8]) -> Mask:
         """Return the pixels of an image, shape (height, width, 3), that have the color."""
-        s = self.settings
-        red, green, blue = (image[..., k].astype(np.float32) for k in range(3))
-        along, across = red - 0.5 * (green + blue), np.float32(np.sqrt(0.75)) * (green - blue)
-        c, d = np.float32(np.cos(np.radians(s.hue))), np.float32(np.sin(np.radians(s.hue)))
-        forward, sideways = c * along + d * across, c * across - d * along
-        largest = image.max(axis=-1).astype(np.float32)
-        smallest = image.min(axis=-1).astype(np.float32)
-        tangent = np.float32(np.tan(np.radians(s.hue_width)))
-        return np.asarray(
-            (np.abs(sideways) <= tangent * forward)
-            & (largest - smallest >= s.saturation * largest)
-            & (largest >= 255.0 * s.value)
-        )
+        s, cv = self.settings, self._cv
+        hsv = cv.cvtColor(np.ascontiguousarray(image), cv.COLOR_RGB2HSV_FULL)
+        low, high = ((s.hue + side * s.hue_width) * 256.0 / 360.0 for side in (-1.0, 1.0))
+        least, dark = int(255.0 * s.saturation), int(255.0 * s.value)
+        found = np.zeros(image.shape[:2], np.uint8)
+        for turn in (-256.0, 0.0, 256.0):
+            a, b = max(0, round(low + turn)), min(255, round(high + turn))
+            if a <= b:
+                found |= cv.inRange(hsv, (a, least, dark), (b, 255, 255))
+        return found > 0
 
     def _parts(self, image: NDArray[np.uint8], seen: CorrectedFrame) -> list[tuple[Mask, Array]]:
         """Return the pixels of each connected part of the color, and depths in which its neighbors' fill its gaps."""
         cv, s = self._cv, self.settings
         red = self.colored(image)
+        rows, columns = np.flatnonzero(red.any(axis=1)), np.flatnonzero(red.any(axis=0))
         if np.count_nonzero(red) < s.least_points:
             return []
-        depth = seen.depth
+        part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        depth, red, whole = seen.depth[part], red[part], red
         limit = np.maximum(APART, 5.0 * seen.noise * depth * depth)
         there = red & (depth > 0.0)
         jump = np.zeros_like(red)
@@ -247,16 +247,25 @@ class ObstacleFinder:
         sure = [k for k in range(1, count) if stats[k, cv.CC_STAT_AREA] >= s.least_points / 2]
         if not sure:
             return []
-        kept = np.isin(labels, sure)
+        chosen = np.zeros(count, bool)
+        chosen[sure] = True
+        kept = chosen[labels]
         away, nearest = cv.distanceTransformWithLabels(
             (~kept).astype(np.uint8), cv.DIST_L2, 5, labelType=cv.DIST_LABEL_PIXEL
         )
-        owner, value = np.zeros(int(nearest.max()) + 1, np.int64), np.zeros(int(nearest.max()) + 1)
-        owner[nearest[kept]], value[nearest[kept]] = labels[kept], depth[kept]
+        owner, sure_depth = np.zeros(int(nearest.max()) + 1, np.int64), np.zeros(int(nearest.max()) + 1)
+        owner[nearest[kept]], sure_depth[nearest[kept]] = labels[kept], depth[kept]
         mine = red & (away <= NEIGHBOR)
-        filled = value[nearest]
+        filled = sure_depth[nearest]
         groups = self._merged(sure, labels, depth, red)
-        return [(mine & np.isin(owner[nearest], group), np.where(kept, depth, filled)) for group in groups]
+        owners, found = owner[nearest], []
+        for group in groups:
+            own, value = np.zeros_like(whole), np.zeros(whole.shape)
+            chosen[:] = False
+            chosen[group] = True
+            own[part], value[part] = mine & chosen[owners], np.where(kept, depth, filled)
+            found.append((own, value))
+        return found
 
     def _merged(self, sure: list[int], labels: Indices, depth: Array, red: Mask) -> list[list[int]]:
         """Return groups of parts: parts of like depth with an occluder between them are the same obstacle."""
@@ -340,12 +349,12 @@ class ObstacleFinder:
         lens = patch.window.lens(lens_of(seen.camera))
         fits = []
         for start in _starts(patch):
-            surface = _surface(start)
+            surface = _unit(start.kind)
             ties, symmetry = (np.arange(3), 0) if start.kind == "box" else (np.array([0, 0, 2]), AXIS)
             prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
             prior[7, 7] = prior[7, 7] if start.kind == "box" else 1e8  # not an unknown of a cylinder
             fit = fit_surface(
-                points, patch.beyond, lens, surface.vertices, surface.faces, ties, symmetry, start.pose, start.pose,
+                points, patch.beyond, lens, surface.vertices * start.size, surface.faces, ties, symmetry, start.pose, start.pose,
                 prior, settings, len(kept),
             )  # fmt: skip
             if np.isfinite(fit.cost):
@@ -411,7 +420,7 @@ def _starts(patch: _Patch) -> list[_Start]:
     if second is None:  # one side is seen, or a round one
         frames.append(_turned(frames[0], np.pi / 4.0))
     starts = [_box(frame, patch) for frame in frames]
-    axes = [first]
+    axes = [first] if second is None else [first, second]
     if len(patch.normals) > 5:
         axes.append(np.linalg.eigh(patch.normals.T @ patch.normals)[1][:, 0])
     else:
@@ -454,28 +463,23 @@ def _box(frame: Array, patch: _Patch) -> _Start:
 
 
 def _cylinder(axis: Array, patch: _Patch) -> _Start:
-    """Return the cylinder along an axis whose circle fits the points of its side (Kasa 1976), or its cap's extents."""
-    frame = _frame(axis, _longest(patch.points, axis))[:, [1, 2, 0]]
+    """Return the cylinder along an axis whose outline and front are those of the points."""
+    sight = patch.points.mean(axis=0)
+    across = np.cross(axis, sight)
+    if np.linalg.norm(across) < 0.02 * np.linalg.norm(sight):  # along the line of sight
+        across = _longest(patch.points, axis)
+    across /= np.linalg.norm(across)
+    frame = np.stack([across, np.cross(axis, across), axis], axis=1)
     along = patch.points @ frame
     low, high = np.percentile(along, [2.0, 98.0], axis=0)
     size, middle = high - low, (high + low) / 2.0
-    width = float(max(size[0], size[1]))
-    radius, center = width / 2.0, middle[:2]
-    sight = frame.T @ patch.points.mean(axis=0)
-    length = float(size[2])
-    if length < FLAT * width:  # the cap alone
-        length = width
-        middle[2] = (low[2] if sight[2] > 0.0 else high[2]) + np.sign(sight[2]) * length / 2.0
-    else:
-        rows = np.column_stack([2.0 * along[:, :2], np.ones(len(along))])
-        x, y, c = np.linalg.lstsq(rows, (along[:, :2] ** 2).sum(axis=1), rcond=None)[0]
-        found = float(np.sqrt(max(c + x * x + y * y, 1e-9)))
-        if 0.7 * radius < found < 1.3 * radius:
-            radius, center = found, np.array([x, y])
-        else:
-            away = sight[:2] / np.linalg.norm(sight[:2])
-            center = middle[:2] + 0.4 * radius * away
-    return _start("cylinder", np.array([2.0 * radius, 2.0 * radius, length]), frame, np.array([*center, middle[2]]))
+    away = frame.T @ sight
+    length, radius = float(size[2]), float(size[0]) / 2.0
+    middle[1] = low[1] + radius if away[1] > 0.0 else high[1] - radius
+    if length < FLAT * 2.0 * radius:  # the cap alone
+        length, middle[1] = 2.0 * radius, (low[1] + high[1]) / 2.0
+        middle[2] = low[2] + length / 2.0 if away[2] > 0.0 else high[2] - length / 2.0
+    return _start("cylinder", np.array([2.0 * radius, 2.0 * radius, length]), frame, middle)
 
 
 def _start(kind: Kind, size: Array, frame: Array, middle: Array) -> _Start:
@@ -485,11 +489,12 @@ def _start(kind: Kind, size: Array, frame: Array, middle: Array) -> _Start:
     return _Start(kind, np.maximum(size, 0.01), pose)
 
 
-def _surface(start: _Start) -> Surface:
-    x, y, z = start.size.tolist()
-    shape: dict[str, object] = {"box": (x, y, z)}
-    if start.kind == "cylinder":
-        shape = {"cylinder": {"radius": x / 2.0, "length": z}}
+@cache
+def _unit(kind: Kind) -> Surface:
+    """Return the surface of a solid whose lengths are 1 m."""
+    shape: dict[str, object] = {"box": (1.0, 1.0, 1.0)}
+    if kind == "cylinder":
+        shape = {"cylinder": {"radius": 0.5, "length": 1.0}}
     return body_surface(Body.model_validate({"name": "obstacle", **shape}), SLICES)
 
 

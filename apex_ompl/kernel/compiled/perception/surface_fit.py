@@ -319,6 +319,9 @@ def fit_surface(
                 r = nx * (x - placed[a, 0]) + ny * (y - placed[a, 1]) + nz * (z - placed[a, 2])
             else:
                 qx, qy, qz = _closest(placed, a, b, c, x, y, z)
+                if p >= outline:  # at the depth of the surface
+                    x, y, z = x * qz / z, y * qz / z, qz
+                    qx, qy, qz = _closest(placed, a, b, c, x, y, z)
                 nx, ny, nz = x - qx, y - qy, z - qz
                 r = math.sqrt(nx * nx + ny * ny + nz * nz)
                 if r < 1e-9:
@@ -349,7 +352,7 @@ def fit_surface(
                 z = depth[i, j]
                 x, y = (j - lens[2]) / lens[0] * z, (i - lens[3]) / lens[1] * z
                 pixel = z / lens[0]
-                r = beyond[i, j] * pixel
+                r = (beyond[i, j] - 0.5) * pixel  # the border is between the centers of pixels
                 weight, loss = _robust(r, reach)
                 variance = edge * edge * pixel * pixel + floor * floor
                 cost += contour_share * loss * reach * reach / variance
