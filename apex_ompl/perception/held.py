@@ -37,7 +37,7 @@ from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
-INFLATION = {"box": 1.2, "cylinder": 0.9, "capsule": 0.9, "sphere": 1.0, "mesh": 1.2, "thin mesh": 1.05}
+INFLATION = {"box": 1.25, "cylinder": 1.0, "capsule": 1.0, "sphere": 1.0, "mesh": 1.35, "thin mesh": 1.05}
 """Factors of the variances of measurements by shape: mean squared normalized errors over their number of dimensions.
 
 They are those of ``python -m benchmarks.perception.held --calibrate``, on scenes of their own. Walls that are thin may be
@@ -45,7 +45,7 @@ taken for one another.
 """
 THIN = 0.5  # share of the volume of its hull below which a mesh is thin
 ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in which they agree, and their least number
-MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
+MISFIT = 2.5  # mean squared error of points over that of noise above which covariances grow
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 UNKNOWN = 1e6  # information of what is known [1/unit^2]

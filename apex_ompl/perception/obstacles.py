@@ -38,7 +38,10 @@ LARGEST_WINDOW = 110  # of which every pixel is used [pixels]
 NORMALS = 400  # that are compared at most
 SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
 SQUARE = 0.5  # cosine between normals of different sides
+THICK = 0.012  # distance from a plane of its points [m]
+PAIRS = 80  # of normals whose common perpendicular may be an axis
 FLAT = 0.2  # share of the largest extent below which an extent is of one side only
+POOR = 2.0  # mean squared error of points over that of noise above which other starts are tried
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
 SLICES = 32
 
@@ -158,7 +161,8 @@ class _Patch(NamedTuple):
         points: Measured points in the optical frame, shape (N, 3) [m].
         guessed: Points whose pixels have the color and whose depths are their neighbors', shape (M, 3) [m].
         beyond: Distances of pixels from those that it may cover, shape (h, w) [pixels of the window].
-        normals: Normals of its surface, shape (K, 3).
+        places: Smoothed points of its surface, shape (K, 3) [m].
+        normals: Normals there, shape (K, 3).
         cut: Whether the image cuts it.
         pixels: Number of pixels with depth.
     """
@@ -167,6 +171,7 @@ class _Patch(NamedTuple):
     points: Array
     guessed: Array
     beyond: Array
+    places: Array
     normals: Array
     cut: bool
     pixels: int
@@ -308,11 +313,11 @@ class ObstacleFinder:
         cut = rows.min() < 2 or columns.min() < 2 or rows.max() > camera.height - 3 or columns.max() > camera.width - 3
         grid = _points(guess, lens)
         points = grid[measured]
-        normals = self._normals(grid, measured, max(2, round(np.sqrt(len(points)) / 6.0)))
-        return _Patch(window, points, grid[mine & ~measured], beyond, normals, bool(cut), pixels)
+        places, normals = self._normals(grid, measured, max(2, round(np.sqrt(len(points)) / 6.0)))
+        return _Patch(window, points, grid[mine & ~measured], beyond, places, normals, bool(cut), pixels)
 
-    def _normals(self, grid: Array, measured: Mask, reach: int) -> Array:
-        """Return normals of smoothed points, by differences over a distance of pixels, shape (K, 3)."""
+    def _normals(self, grid: Array, measured: Mask, reach: int) -> tuple[Array, Array]:
+        """Return smoothed points and normals there by differences over a distance of pixels, both of shape (K, 3)."""
         cv = self._cv
         weight = measured.astype(float)
         share = cv.blur(weight, (reach, reach), borderType=cv.BORDER_CONSTANT)
@@ -325,7 +330,8 @@ class ObstacleFinder:
         across = (smooth[r:-r, 2 * r :] - smooth[r:-r, : -2 * r])[inner]
         normals = np.cross(down, across)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        return np.asarray(normals[:: max(1, len(normals) // NORMALS)])
+        step = max(1, len(normals) // NORMALS)
+        return smooth[r:-r, r:-r][inner][::step], np.asarray(normals[::step])
 
     def _wanted(self, patch: _Patch, seen: CorrectedFrame, others: Sequence[tuple[Array, float]]) -> bool:
         pose, s = seen.registration.pose, self.settings
@@ -347,8 +353,9 @@ class ObstacleFinder:
         points = np.concatenate([kept, guessed])
         settings = self._fit_settings(patch, len(patch.points) / max(len(kept), 1), seen)
         lens = patch.window.lens(lens_of(seen.camera))
-        fits = []
-        for start in _starts(patch):
+        fits: list[tuple[_Start, SurfaceFit]] = []
+
+        def run(start: _Start) -> None:
             surface = _unit(start.kind)
             ties, symmetry = (np.arange(3), 0) if start.kind == "box" else (np.array([0, 0, 2]), AXIS)
             prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
@@ -359,9 +366,19 @@ class ObstacleFinder:
             )  # fmt: skip
             if np.isfinite(fit.cost):
                 fits.append((start, fit))
+
+        for one in _starts(patch):
+            run(one)
         if not fits:
             return None
         start, best = min(fits, key=lambda one: one[1].cost)
+        if best.cost > POOR * settings.point_share * len(kept):  # from the points' extents along the axes found
+            for kind in ("box", "cylinder"):
+                rest = [one for one in fits if one[0].kind == kind]
+                if rest:
+                    turn = min(rest, key=lambda one: one[1].cost)[1].rotation
+                    run(_box(turn, patch) if kind == "box" else _cylinder(turn[:, 2], patch))
+            start, best = min(fits, key=lambda one: one[1].cost)
         return _answer(start, best, patch, seen)
 
     def _fit_settings(self, patch: _Patch, thinning: float, seen: CorrectedFrame) -> FitSettings:
@@ -398,33 +415,59 @@ def _occluded_between(first: Indices, second: Indices, depth: Array, red: Mask, 
     return bool(np.mean((between[gap] > 0.0) & (between[gap] < before - BEFORE)) > 0.6)
 
 
-def _plane(normals: Array) -> Array | None:
-    """Return the mean of the normals of the largest plane; None without normals."""
+def _plane(places: Array, normals: Array) -> Array | None:
+    """Return the normal of the plane through the places of the largest group of like normals; None without normals."""
     if not len(normals):
         return None
     alike = normals @ normals.T > SAME_WAY
-    group = normals[alike[int(np.argmax(alike.sum(axis=1)))]]
-    mean = group.mean(axis=0)
-    return np.asarray(mean / np.linalg.norm(mean))
+    group = alike[int(np.argmax(alike.sum(axis=1)))]
+    mean = normals[group].mean(axis=0)
+    mean /= np.linalg.norm(mean)
+    for _ in range(2):
+        height = places @ mean
+        near = group & (np.abs(height - np.median(height[group])) < THICK)
+        if np.count_nonzero(near) < 6:
+            break
+        own = places[near] - places[near].mean(axis=0)
+        found = np.linalg.eigh(own.T @ own)[1][:, 0]
+        mean = found * np.sign(found @ mean)
+    return np.asarray(mean)
+
+
+def _round_axis(normals: Array) -> Array | None:
+    """Return the axis to which most normals are perpendicular or, those of a cap, parallel (RANSAC); None for few."""
+    if len(normals) < 8:
+        return None
+    rng = np.random.default_rng(0)
+    pairs = rng.integers(len(normals), size=(PAIRS, 2))
+    axes = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+    lengths = np.linalg.norm(axes, axis=1)
+    if not (lengths > 0.3).any():
+        return None
+    axes = axes[lengths > 0.3] / lengths[lengths > 0.3, None]
+    along = np.abs(normals @ axes.T)
+    best = int(np.argmax((along < 0.2).sum(axis=0) + (along > 0.95).sum(axis=0)))
+    side = normals[along[:, best] < 0.25]
+    return np.asarray(np.linalg.eigh(side.T @ side)[1][:, 0])
 
 
 def _starts(patch: _Patch) -> list[_Start]:
     """Return boxes and cylinders from which fits start, in the optical frame."""
-    first = _plane(patch.normals)
+    first = _plane(patch.places, patch.normals)
     if first is None:
         first = -np.median(patch.points, axis=0)
         first /= np.linalg.norm(first)
-    rest = patch.normals[np.abs(patch.normals @ first) < SQUARE]
-    second = _plane(rest) if len(rest) > 0.06 * len(patch.normals) and len(rest) > 3 else None
+    rest = np.abs(patch.normals @ first) < SQUARE
+    enough = np.count_nonzero(rest) > max(3.0, 0.06 * len(patch.normals))
+    second = _plane(patch.places[rest], patch.normals[rest]) if enough else None
     frames = [_frame(first, second if second is not None else _longest(patch.points, first))]
     if second is None:  # one side is seen, or a round one
         frames.append(_turned(frames[0], np.pi / 4.0))
     starts = [_box(frame, patch) for frame in frames]
     axes = [first] if second is None else [first, second]
-    if len(patch.normals) > 5:
-        axes.append(np.linalg.eigh(patch.normals.T @ patch.normals)[1][:, 0])
-    else:
-        axes.append(frames[0][:, 1])
+    round_one = _round_axis(patch.normals)
+    if round_one is not None:
+        axes.append(round_one)
     return starts + [_cylinder(axis, patch) for axis in axes]
 
 
