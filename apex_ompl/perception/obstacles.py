@@ -30,10 +30,10 @@ from apex_ompl.util.validation import check_number, check_positive
 Mask = NDArray[np.bool_]
 Kind = Literal["box", "cylinder"]
 
-APART = 0.04  # difference of neighboring depths of different surfaces [m]
+APART = 0.04  # second difference of neighboring depths of different surfaces [m]
 BEFORE = 0.03  # by which an occluder is before an obstacle [m]
 PAD = 8  # around an obstacle's pixels [pixels]
-NEIGHBOR = 5  # pixels from a measured one within which pixels of the color belong to it
+NEIGHBOR = 12  # pixels from a measured one within which pixels of the color belong to it
 LARGEST_WINDOW = 110  # of which every pixel is used [pixels]
 NORMALS = 400  # that are compared at most
 SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
@@ -41,6 +41,8 @@ SQUARE = 0.5  # cosine between normals of different sides
 THICK = 0.012  # distance from a plane of its points [m]
 PAIRS = 80  # of normals whose common perpendicular may be an axis
 FLAT = 0.2  # share of the largest extent below which an extent is of one side only
+KNOWN = 1e8  # information of what is no unknown
+MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
 POOR = 2.0  # mean squared error of points over that of noise above which other starts are tried
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
 SLICES = 32
@@ -81,7 +83,7 @@ class ObstacleSettings:
     edge: float = 0.5
     point_share: float = 1.4
     contour_share: float = 0.3
-    inflation: float = 1.0
+    inflation: float = 1.6
     most_points: int = 300
 
     def __post_init__(self) -> None:
@@ -238,15 +240,8 @@ class ObstacleFinder:
             return []
         part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         depth, red, whole = seen.depth[part], red[part], red
-        limit = np.maximum(APART, 5.0 * seen.noise * depth * depth)
         there = red & (depth > 0.0)
-        jump = np.zeros_like(red)
-        across = (np.abs(np.diff(depth, axis=1)) > limit[:, 1:]) & there[:, 1:] & there[:, :-1]
-        down = (np.abs(np.diff(depth, axis=0)) > limit[1:]) & there[1:] & there[:-1]
-        jump[:, 1:] |= across
-        jump[:, :-1] |= across
-        jump[1:] |= down
-        jump[:-1] |= down
+        jump = _steps(depth, np.maximum(APART, 9.0 * seen.noise * depth * depth))
         core = cv.morphologyEx((there & ~jump).astype(np.uint8), cv.MORPH_OPEN, np.ones((3, 3), np.uint8))
         count, labels, stats, _ = cv.connectedComponentsWithStats(core, connectivity=4)
         sure = [k for k in range(1, count) if stats[k, cv.CC_STAT_AREA] >= s.least_points / 2]
@@ -358,8 +353,7 @@ class ObstacleFinder:
         def run(start: _Start) -> None:
             surface = _unit(start.kind)
             ties, symmetry = (np.arange(3), 0) if start.kind == "box" else (np.array([0, 0, 2]), AXIS)
-            prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
-            prior[7, 7] = prior[7, 7] if start.kind == "box" else 1e8  # not an unknown of a cylinder
+            prior = _prior(start.kind)
             fit = fit_surface(
                 points, patch.beyond, lens, surface.vertices * start.size, surface.faces, ties, symmetry, start.pose, start.pose,
                 prior, settings, len(kept),
@@ -379,14 +373,15 @@ class ObstacleFinder:
                     turn = min(rest, key=lambda one: one[1].cost)[1].rotation
                     run(_box(turn, patch) if kind == "box" else _cylinder(turn[:, 2], patch))
             start, best = min(fits, key=lambda one: one[1].cost)
-        return _answer(start, best, patch, seen)
+        misfit = best.cost / (settings.point_share * len(kept))
+        return _answer(start, best, max(1.0, misfit / MISFIT), patch, seen)
 
     def _fit_settings(self, patch: _Patch, thinning: float, seen: CorrectedFrame) -> FitSettings:
         s = self.settings
         shared = max(1.0, (seen.camera.depth.correlation / patch.window.stride) ** 2)
         return FitSettings(
             noise=seen.noise, floor=s.floor, edge=s.edge, point_share=s.point_share * thinning / shared / s.inflation,
-            contour_share=s.contour_share * patch.window.stride / s.inflation, first=0.04, last=0.02, reach=0.02, steps=10,
+            contour_share=s.contour_share * patch.window.stride / s.inflation, first=0.04, last=0.02, reach=0.02, steps=12,
         )  # fmt: skip
 
 
@@ -399,6 +394,17 @@ def _points(depth: Array, lens: Array) -> Array:
     """Return the points of a depth image in the optical frame, shape (h, w, 3) [m]."""
     rows, columns = np.mgrid[0 : depth.shape[0], 0 : depth.shape[1]]
     return np.stack([(columns - lens[2]) / lens[0] * depth, (rows - lens[3]) / lens[1] * depth, depth], axis=-1)
+
+
+def _steps(depth: Array, limit: Array) -> Mask:
+    """Return where depths have a step: second differences above a limit in a row or a column.
+
+    First differences would take surfaces seen from the side for steps.
+    """
+    found = np.zeros(depth.shape, bool)
+    found[:, 1:-1] = np.abs(depth[:, 2:] - 2.0 * depth[:, 1:-1] + depth[:, :-2]) > limit[:, 1:-1]
+    found[1:-1] |= np.abs(depth[2:] - 2.0 * depth[1:-1] + depth[:-2]) > limit[1:-1]
+    return found
 
 
 def _occluded_between(first: Indices, second: Indices, depth: Array, red: Mask, before: float) -> bool:
@@ -532,6 +538,14 @@ def _start(kind: Kind, size: Array, frame: Array, middle: Array) -> _Start:
     return _Start(kind, np.maximum(size, 0.01), pose)
 
 
+def _prior(kind: Kind) -> Array:
+    """Return the information before a fit, shape (9, 9)."""
+    prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
+    if kind == "cylinder":  # both diameters are one unknown
+        prior[7, 7] = KNOWN
+    return prior
+
+
 @cache
 def _unit(kind: Kind) -> Surface:
     """Return the surface of a solid whose lengths are 1 m."""
@@ -541,11 +555,14 @@ def _unit(kind: Kind) -> Surface:
     return body_surface(Body.model_validate({"name": "obstacle", **shape}), SLICES)
 
 
-def _answer(start: _Start, fit: SurfaceFit, patch: _Patch, seen: CorrectedFrame) -> SeenObstacle:
-    """Return the answer in the world, with covariances of lengths for those of their logarithms."""
-    registration = seen.registration
-    own = np.linalg.inv(fit.information)
-    lever = own @ fit.cross
+def _answer(start: _Start, fit: SurfaceFit, factor: float, patch: _Patch, seen: CorrectedFrame) -> SeenObstacle:
+    """Return the answer in the world, with covariances of lengths for those of their logarithms.
+
+    Variances of measurements grow by a factor.
+    """
+    registration, prior = seen.registration, _prior(start.kind)
+    own = np.linalg.inv(prior + (fit.information - prior) / factor)
+    lever = own @ fit.cross / factor
     covariance = own + lever @ registration.covariance @ lever.T
     size = start.size * fit.scale
     if start.kind == "cylinder":  # one unknown for both diameters

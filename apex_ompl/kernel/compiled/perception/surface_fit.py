@@ -20,6 +20,7 @@ AXIS, BALL = 1, 2  # symmetries: of a body of revolution about its z, and of a b
 REACH = 8  # pixels beside a drawing within which points belong to it
 DIAGONAL = math.sqrt(2.0)
 LARGEST_TURN = 0.3  # of a step [rad]
+LARGEST_GROWTH = 0.15  # of the logarithm of a length in a step
 
 
 @entry_point
@@ -373,6 +374,8 @@ def fit_surface(
             return math.inf
         angle = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
         length = min(1.0, LARGEST_TURN / max(angle, 1e-12))
+        for k in range(6, n):
+            length = min(length, LARGEST_GROWTH / max(abs(vector[k]), 1e-12))
         _turn(rotation, length * vector[0], length * vector[1], length * vector[2])
         for k in range(3):
             position[k] += length * vector[3 + k]
