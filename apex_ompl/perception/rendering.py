@@ -271,31 +271,39 @@ class DepthSensor:
         check_number(self.bias, "bias", -0.5, 0.5)
         check_number(self.holes, "holes", 0.0, 1.0)
 
-    def measure(self, view: View, camera: Camera, rng: np.random.Generator, labels: Sequence[int] = ()) -> Array:
-        """Return measured depths, shape (height, width) [m], 0 where there is none.
+    def measure(
+        self, view: View, camera: Camera, rng: np.random.Generator, labels: Sequence[int] = (), frames: int = 1
+    ) -> list[Array]:  # fmt: skip
+        """Return measured depths of some frames, each of shape (height, width) [m], 0 where there is none.
 
         Args:
             view: What the camera sees.
             camera: The camera.
             rng: Source of the noise.
-            labels: Labels of surfaces that may have a patch without depth.
+            labels: Labels of surfaces that may have a patch without depth, the same in all frames.
+            frames: Number of frames.
         """
         depth, errors = view.depth, camera.depth
         width = errors.correlation
-        own = rng.standard_normal(depth.shape)
-        blocks = rng.standard_normal(tuple(-(-n // width) for n in depth.shape))
-        common = blocks.repeat(width, axis=0).repeat(width, axis=1)[: depth.shape[0], : depth.shape[1]]
-        noise = np.sqrt(1.0 - COMMON**2) * own + COMMON * common
         low, high = _least_and_largest(depth)
-        edge, luck = high - low > JUMP, rng.random(depth.shape)
-        flying = edge & (luck >= MISSING) & (luck < MISSING + FLYING)
-        found = np.where(flying, low + (high - low) * (luck - MISSING) / FLYING, depth)
-        found = found + self.gain * errors.noise * found**2 * noise
-        gone = (depth <= 0.0) | edge & (luck < MISSING) | self._hidden(depth, camera)
+        edge = high - low > JUMP
+        hidden = (depth <= 0.0) | self._hidden(depth, camera)
         for label in labels:
-            gone |= self._patch(view.labels == label, rng)
-        found = np.round(found * (1.0 + self.bias) / QUANTUM) * QUANTUM
-        return np.where(gone | (found < errors.nearest) | (found > errors.farthest), 0.0, found)
+            hidden |= self._patch(view.labels == label, rng)
+        found = []
+        for _ in range(frames):
+            own = rng.standard_normal(depth.shape)
+            blocks = rng.standard_normal(tuple(-(-n // width) for n in depth.shape))
+            common = blocks.repeat(width, axis=0).repeat(width, axis=1)[: depth.shape[0], : depth.shape[1]]
+            noise = np.sqrt(1.0 - COMMON**2) * own + COMMON * common
+            luck = rng.random(depth.shape)
+            flying = edge & (luck >= MISSING) & (luck < MISSING + FLYING)
+            seen = np.where(flying, low + (high - low) * (luck - MISSING) / FLYING, depth)
+            seen = seen + self.gain * errors.noise * seen**2 * noise
+            seen = np.round(seen * (1.0 + self.bias) / QUANTUM) * QUANTUM
+            gone = hidden | (edge & (luck < MISSING)) | (seen < errors.nearest) | (seen > errors.farthest)
+            found.append(np.where(gone, 0.0, seen))
+        return found
 
     def _hidden(self, depth: Array, camera: Camera) -> NDArray[np.bool_]:
         """Return the pixels whose surface the second imager does not see."""

@@ -265,13 +265,11 @@ class SceneGenerator:
         joints = dict(zip(self.robot.joint_names, state.tolist(), strict=True))
         light, sensor = Light.random(rng), given.sensor
         sensor = replace(sensor, bias=(1.0 + sensor.bias) * (1.0 + rng.normal(0.0, given.scale_spread)) - 1.0)
+        depths = sensor.measure(view, camera, rng, labels, given.frames)
         frames = tuple(
-            Frame(
-                camera, sensor.measure(view, camera, rng, labels if t == 0 else ()),
-                colors(view, parts, light, rng) if given.colors else None, 0.1 * t, joints,
-            )
-            for t in range(given.frames)
-        )  # fmt: skip
+            Frame(camera, depth, colors(view, parts, light, rng) if given.colors else None, 0.1 * t, joints)
+            for t, depth in enumerate(depths)
+        )
         objects = tuple(self._truth(one, HELD + k, view, camera, pose, there[k]) for k, one in enumerate(held))
         obstacle = None
         if given.obstacle is not None and solid is not None:

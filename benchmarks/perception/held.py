@@ -9,14 +9,17 @@ outside the image do not count. "no answer" is the share of objects for which a 
 gate takes objects whose own standard deviations are small. "squared" is the mean of normalized squared errors over their
 6 dimensions with its 95 % band by chi-squared, "within" the share of objects within the 95 % ellipsoid.
 
-Usage: python -m benchmarks.perception.held [-n 300] [--calibrate]
+In brackets: each seed.
+
+Usage: python -m benchmarks.perception.held [-n 150] [--calibrate]
 """
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +27,7 @@ import pinocchio as pin
 from tqdm import tqdm
 
 from apex_ompl.perception.averaging import mean_frame
-from apex_ompl.perception.held import HeldObjectFinder, HeldSettings
+from apex_ompl.perception.held import HeldObjectFinder
 from apex_ompl.perception.rendering import Mujoco, Renderer, ZBuffer
 from apex_ompl.perception.synthetic import SceneGenerator, SyntheticSettings, TrueObject
 from apex_ompl.problems.objects import DATA
@@ -41,7 +44,7 @@ FRAMES = 9
 SEEN = 0.85
 GATE = (0.0045, 2.2)  # largest own standard deviations of face [m] and axis [degrees]
 DIMENSIONS = 6
-CHI_SQUARED = 12.592  # 95 % of six degrees of freedom
+CHI_SQUARED, MEDIAN = 12.592, 5.348  # 95 % and 50 % of six degrees of freedom
 METHODS = ("grasp alone", "one frame", "nine frames")
 
 
@@ -96,15 +99,12 @@ def _sample(scene: int, method: str, one: TrueObject, found: Any, spent: float) 
     )  # fmt: skip
 
 
-def samples(
-    made: Robot, renderer: Renderer, seed: int, n: int, settings: HeldSettings | None = None,
-    drawn: SyntheticSettings | None = None,
-) -> list[Sample]:  # fmt: skip
+def samples(made: Robot, renderer: Renderer, seed: int, n: int) -> list[Sample]:
     """Return all objects of ``n`` scenes, found by each method."""
     generator, found = SceneGenerator(made, DATA, renderer), []
     for k in tqdm(range(n), desc=f"{type(renderer).__name__} {seed}"):
-        scene = generator.draw(np.random.default_rng((seed, k)), drawn or SyntheticSettings(frames=FRAMES))
-        finder = HeldObjectFinder(made, [one.reported for one in scene.objects], settings)
+        scene = generator.draw(np.random.default_rng((seed, k)), SyntheticSettings(frames=FRAMES))
+        finder = HeldObjectFinder(made, [one.reported for one in scene.objects])
         answers = {"grasp alone": (finder.by_grasp(scene.frames[0]), 0.0)}
         for method, count in zip(METHODS[1:], (1, FRAMES), strict=True):
             started = time.process_time()
@@ -132,49 +132,56 @@ def passes(one: Sample) -> bool:
     return one.face_spread <= GATE[0] and (one.kind == "ball" or one.axis_spread <= GATE[1])
 
 
-def errors_row(label: str, chosen: Sequence[Sample], of: int, n: int) -> list[Any]:
-    """Return the cells of a row of errors."""
-    answered = [one for one in chosen if not one.reason]
-    face = 1e3 * np.array([one.face for one in answered])
-    axis = np.array([one.axis for one in answered if np.isfinite(one.axis)])
-    spent = 1e3 * np.array(sorted({one.scene: one.spent for one in chosen}.values()))
+def _both(values: dict[int, np.ndarray], p: float, factor: float) -> str:
+    """Return a percentile of all values, and in brackets that of each seed."""
+    total = np.concatenate(list(values.values()))
+    each = ", ".join(f"{factor * record.percentiles(one, p)[0]:.1f}" for one in values.values())
+    return f"{factor * record.percentiles(total, p)[0]:.1f} ({each})"
+
+
+def errors_row(label: str, chosen: dict[int, list[Sample]], of: int, n: int) -> list[Any]:
+    """Return the cells of a row of errors of the chosen objects of each seed, among a number of objects."""
+    answered = {seed: [one for one in found if not one.reason] for seed, found in chosen.items()}
+    face = {seed: np.array([one.face for one in found]) for seed, found in answered.items()}
+    axis = {
+        seed: np.array([one.axis for one in found if np.isfinite(one.axis)]) for seed, found in answered.items()
+    }  # fmt: skip
+    count = sum(map(len, answered.values()))
+    spent = 1e3 * np.array(list({(k, one.scene): one.spent for k, found in chosen.items() for one in found}.values()))
     times = [f"{v:.1f}" for v in record.percentiles(spent, 50, 95)] if len(spent) and spent.max() > 0.0 else ["", ""]
     return [
-        label, n, len(answered), f"{len(answered) / max(of, 1):.2f}",
-        *(f"{v:.1f}" for v in record.percentiles(face, 50, 95)),
-        *(f"{v:.1f}" for v in record.percentiles(axis, 50, 95)), *times,
+        label, n, count, f"{count / max(of, 1):.2f}", _both(face, 50, 1e3), _both(face, 95, 1e3), _both(axis, 50, 1.0),
+        _both(axis, 95, 1.0), *times,
     ]  # fmt: skip
 
 
-def errors_rows(renderer: str, seed: int, all_samples: Sequence[Sample], n: int) -> list[list[Any]]:
-    """Return the rows of errors of a renderer and a seed."""
+def errors_rows(renderer: str, drawn: dict[int, list[Sample]], n: int) -> list[list[Any]]:
+    """Return the rows of errors of a renderer, by seed."""
     rows = []
     for method in METHODS:
-        mine = [one for one in all_samples if one.method == method]
-        rows.append(errors_row(f"{method}, {renderer}, seed {seed}", mine, len(mine), n))
-        if method == "grasp alone":
+        mine = {seed: [one for one in found if one.method == method] for seed, found in drawn.items()}
+        total = sum(map(len, mine.values()))
+        rows.append(errors_row(f"{method}, {renderer}", mine, total, n))
+        if method == METHODS[0]:
             continue
-        wide = [one for one in mine if one.seen >= SEEN]
-        rows.append(errors_row(f"{method}, 85 % seen, {renderer}, seed {seed}", wide, len(wide), n))
-        gated = [one for one in mine if not one.reason and passes(one)]
-        rows.append(errors_row(f"{method}, gate, {renderer}, seed {seed}", gated, len(mine), n))
+        wide = {seed: [one for one in found if one.seen >= SEEN] for seed, found in mine.items()}
+        rows.append(errors_row(f"{method}, 85 % seen, {renderer}", wide, sum(map(len, wide.values())), n))
+        gated = {seed: [one for one in found if not one.reason and passes(one)] for seed, found in mine.items()}
+        rows.append(errors_row(f"{method}, gate, {renderer}", gated, total, n))
     return rows
 
 
-def covariance_rows(all_samples: Sequence[Sample]) -> list[list[Any]]:
+def covariance_rows(found: Sequence[Sample]) -> list[list[Any]]:
     """Return the rows of normalized squared errors by kind of object."""
     rows = []
     for method in METHODS:
-        for kind in sorted({one.kind for one in all_samples}):
-            squared = np.array(
-                [s.squared for s in all_samples if s.method == method and s.kind == kind and not s.reason]
-            )
+        for kind in sorted({one.kind for one in found}):
+            squared = np.array([s.squared for s in found if s.method == method and s.kind == kind and not s.reason])
             low, high = band(len(squared))
-            share = float(np.mean(squared < CHI_SQUARED))
-            slack = 1.96 * np.sqrt(0.05 * 0.95 / len(squared))
+            share, slack = float(np.mean(squared < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / len(squared))
             rows.append(
                 [method, kind, len(squared), f"{squared.mean() / DIMENSIONS:.2f}", f"{low:.2f} to {high:.2f}",
-                 f"{np.median(squared) / 5.348:.2f}", f"{share:.3f}", f"{0.95 - slack:.3f} to {min(1.0, 0.95 + slack):.3f}"]
+                 f"{np.median(squared) / MEDIAN:.2f}", f"{share:.3f}", f"{0.95 - slack:.3f} to {min(1.0, 0.95 + slack):.3f}"]
             )  # fmt: skip
     return rows
 
@@ -182,3 +189,51 @@ def covariance_rows(all_samples: Sequence[Sample]) -> list[list[Any]]:
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """Return a Markdown table."""
     return "\n".join([record.row(list(head)), record.row(["---"] * len(head)), *(record.row(list(r)) for r in rows)])
+
+
+HEAD = (
+    "method", "frames", "objects", "share", "face p50 mm", "face p95 mm", "axis p50 deg", "axis p95 deg", "ms p50", "ms p95",
+)  # fmt: skip
+SQUARED = ("method", "kind", "objects", "squared", "band", "median", "within", "its band")
+
+
+def calibrate(made: Robot, n: int) -> None:
+    """Print mean normalized squared errors by kind, of scenes of their own, from which the inflation is chosen."""
+    found = [
+        one
+        for renderer, seed in zip((ZBuffer(), Mujoco()), CALIBRATION_SEEDS, strict=True)
+        for one in samples(made, renderer, seed, n)
+    ]
+    print(table(SQUARED, covariance_rows(found)))
+
+
+def main() -> None:
+    """Measure, and write the results."""
+    parser = record.parser(__doc__ or "", 150, "scenes of a seed and a renderer")
+    parser.add_argument("--calibrate", action="store_true", help="print squared errors on seeds that are not reported")
+    given, made = parser.parse_args(), robot()
+    if given.calibrate:
+        calibrate(made, given.n)
+        return
+    rows, all_samples = [], []
+    for renderer in (ZBuffer(), Mujoco()):
+        drawn = {seed: samples(made, renderer, seed, given.n) for seed in SEEDS}
+        rows += errors_rows(type(renderer).__name__, drawn, given.n * len(SEEDS))
+        all_samples += [one for found in drawn.values() for one in found]
+    missed: dict[str, int] = {}
+    for one in all_samples:
+        if one.reason and one.method == METHODS[-1]:
+            words = re.sub(r"'[^']*':?|[0-9.]+ ?%?", "", one.reason).strip()
+            missed[words] = missed.get(words, 0) + 1
+    reasons = [[reason, count] for reason, count in sorted(missed.items(), key=lambda item: -item[1])]
+    parts = [
+        table(HEAD, rows),
+        table(SQUARED, covariance_rows(all_samples)),
+        table(("no answer, nine frames", "N"), reasons),
+    ]
+    data = {"rows": rows, "covariance": covariance_rows(all_samples), "samples": [asdict(one) for one in all_samples]}
+    record.write("perception_held", data, "\n\n".join(parts), n=given.n, seeds=list(SEEDS))
+
+
+if __name__ == "__main__":
+    run_script(main)
