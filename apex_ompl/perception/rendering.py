@@ -207,7 +207,7 @@ class Mujoco:
         own.sensor_size = [camera.width, camera.height]
         own.focal_pixel = camera.focal
         shift = np.array(camera.center) - (np.array([camera.width, camera.height]) - 1.0) / 2.0
-        own.principal_pixel = [shift[0], shift[1]]
+        own.principal_pixel = [-shift[0], -shift[1]]  # of the image's center from the principal point
 
 
 def round_or_box(solid: coal.CollisionGeometry) -> bool:
