@@ -43,6 +43,7 @@ PAIRS = 80  # of normals whose common perpendicular may be an axis
 FLAT = 0.2  # share of the largest extent below which an extent is of one side only
 KNOWN = 1e8  # information of what is no unknown
 MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
+MOST_GUESSED = 1000  # points at the border that are used at most
 POOR = 2.0  # mean squared error of points over that of noise above which other starts are tried
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
 SLICES = 32
@@ -161,7 +162,7 @@ class _Patch(NamedTuple):
     Attributes:
         window: The window.
         points: Measured points in the optical frame, shape (N, 3) [m].
-        guessed: Points whose pixels have the color and whose depths are their neighbors', shape (M, 3) [m].
+        guessed: Points at the border, or whose depths are their neighbors', shape (M, 3) [m].
         beyond: Distances of pixels from those that it may cover, shape (h, w) [pixels of the window].
         places: Smoothed points of its surface, shape (K, 3) [m].
         normals: Normals there, shape (K, 3).
@@ -309,7 +310,8 @@ class ObstacleFinder:
         grid = _points(guess, lens)
         points = grid[measured]
         places, normals = self._normals(grid, measured, max(2, round(np.sqrt(len(points)) / 6.0)))
-        return _Patch(window, points, grid[mine & ~measured], beyond, places, normals, bool(cut), pixels)
+        inner = self._cv.erode(mine.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1) > 0
+        return _Patch(window, points, grid[mine & ~(measured & inner)], beyond, places, normals, bool(cut), pixels)
 
     def _normals(self, grid: Array, measured: Mask, reach: int) -> tuple[Array, Array]:
         """Return smoothed points and normals there by differences over a distance of pixels, both of shape (K, 3)."""
@@ -344,7 +346,7 @@ class ObstacleFinder:
         """Return the solid of the lowest cost among all starts; None where no fit found any."""
         s = self.settings
         kept = patch.points[_spaced(len(patch.points), s.most_points)]
-        guessed = patch.guessed[_spaced(len(patch.guessed), s.most_points)]
+        guessed = patch.guessed[_spaced(len(patch.guessed), MOST_GUESSED)]
         points = np.concatenate([kept, guessed])
         settings = self._fit_settings(patch, len(patch.points) / max(len(kept), 1), seen)
         lens = patch.window.lens(lens_of(seen.camera))

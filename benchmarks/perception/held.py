@@ -37,7 +37,11 @@ from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
 
-DEPENDS = ("apex_ompl/perception", "apex_ompl/kernel/compiled/perception", "apex_ompl/kernel/perception.py")
+DEPENDS = (
+    "apex_ompl/perception/held.py", "apex_ompl/perception/registration.py", "apex_ompl/perception/averaging.py",
+    "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py", "apex_ompl/perception/synthetic.py",
+    "apex_ompl/perception/camera.py", "apex_ompl/kernel/compiled/perception", "apex_ompl/kernel/perception.py",
+)  # fmt: skip
 SEEDS = (11, 12)
 CALIBRATION_SEEDS = (1001, 1002)
 FRAMES = 9

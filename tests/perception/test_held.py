@@ -57,7 +57,11 @@ def test_objects_are_found_within_their_covariance(generator: SceneGenerator, ro
 
 def test_a_robot_that_reports_the_truth_is_found_exactly(generator: SceneGenerator, robot: Robot) -> None:
     quiet = SyntheticSettings(
-        camera_shift=0.0, camera_turn=0.0, synergy_spread=0.0, scale_spread=0.0, sensor=DepthSensor(gain=0.02, holes=0.0)
+        camera_shift=0.0,
+        camera_turn=0.0,
+        synergy_spread=0.0,
+        scale_spread=0.0,
+        sensor=DepthSensor(gain=0.02, holes=0.0),
     )
     scene = generator.draw(np.random.default_rng((5, 3)), quiet)
     for one, found in zip(scene.objects, found_in(scene, robot), strict=True):

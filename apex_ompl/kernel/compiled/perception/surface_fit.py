@@ -104,8 +104,8 @@ def _chamfer(distance: Floats) -> None:
 
 
 @inlined
-def _seen_beside(index: Integers, row: int, column: int) -> int:
-    """Return the triangle of the drawn pixel that is nearest to a pixel, or -1 for none within ``REACH``."""
+def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, float]:
+    """Return the triangle of the drawn pixel nearest to a pixel, or -1 for none within ``REACH``, and its distance."""
     height, width = index.shape
     best, found = REACH * REACH + 1, -1
     for r in range(REACH + 1):
@@ -119,7 +119,7 @@ def _seen_beside(index: Integers, row: int, column: int) -> int:
                     apart = (i - row) * (i - row) + (j - column) * (j - column)
                     if apart < best:
                         best, found = apart, index[i, j]
-    return found
+    return found, math.sqrt(best)
 
 
 @inlined
@@ -309,8 +309,9 @@ def fit_surface(
             if seen and p >= outline:
                 continue
             share, largest = (point_share, cutoff) if p < outline else (contour_share, max(cutoff, reach))
+            apart = 0.0
             if inside and not seen:
-                k = _seen_beside(index, line, column)
+                k, apart = _seen_beside(index, line, column)
             if k < 0:
                 cost += share / 3.0 * (last / (noise * z * z + floor)) ** 2
                 continue
@@ -328,6 +329,8 @@ def fit_surface(
                 if r < 1e-9:
                     continue
                 nx, ny, nz = nx / r, ny / r, nz / r
+                if p >= outline:  # as far as the outline is from a pixel that it covers too much
+                    r = (apart - 0.5) * z / lens[0]
             distance = math.sqrt(x * x + y * y + z * z)
             cosine = (nx * x + ny * y + nz * z) / distance
             across = edge * z / lens[0]
