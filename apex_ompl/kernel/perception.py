@@ -52,7 +52,7 @@ class Drawn(NamedTuple):
         faces: Triangles, shape (F, 3).
         velocities: Derivatives of the vertices by other unknowns, shape (K, V, 3).
         depth: Depths at every ``stride``-th pixel, shape (h, w) [m].
-        index: Triangle seen there, or -1, shape (h, w).
+        triangle: Triangle seen there, or -1, shape (h, w).
         lens: Lens of that image.
         stride: Pixels from one to the next.
     """
@@ -61,7 +61,7 @@ class Drawn(NamedTuple):
     faces: Integers
     velocities: Array
     depth: Array
-    index: Integers
+    triangle: Integers
     lens: Array
     stride: int
 
@@ -86,7 +86,7 @@ def register_rows(
     n = len(unknowns)
     matrix, vector = np.zeros((n, n)), np.zeros(n)
     count = registration.register_rows(
-        measured, drawn.depth, drawn.index, drawn.vertices, drawn.faces, drawn.velocities, drawn.lens, drawn.stride,
+        measured, drawn.depth, drawn.triangle, drawn.vertices, drawn.faces, drawn.velocities, drawn.lens, drawn.stride,
         unknowns, noise, floor, gate, cutoff, matrix, vector, np.empty(n),
     )  # fmt: skip
     return matrix, vector, int(count)
@@ -181,8 +181,8 @@ class SurfaceFit(NamedTuple):
         information: Of turn and shift in the axes of the optical frame [rad, m], and of logarithms of the scales where
             they are unknown, shape (n, n).
         cross: Second derivatives by these, and by turn, shift and scale of the camera's error, shape (n, 7).
-        depth: The surface at its pose where ``index`` is not negative, shape (h, w) [m].
-        index: Triangle seen, or -1, shape (h, w).
+        depth: The surface at its pose where ``triangle`` is not negative, shape (h, w) [m].
+        triangle: Triangle seen, or -1, shape (h, w).
     """
 
     cost: float
@@ -192,7 +192,7 @@ class SurfaceFit(NamedTuple):
     information: Array
     cross: Array
     depth: Array
-    index: Integers
+    triangle: Integers
 
 
 def fit_surface(
@@ -223,7 +223,8 @@ def fit_surface(
     s = settings
     numbers = s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach
     cost = surface_fit.fit_surface(
-        np.ascontiguousarray(points), len(points) if outline is None else outline, beyond, lens, vertices, faces, ties, symmetry, rotation, position, scale,
+        np.ascontiguousarray(points), len(points) if outline is None else outline, beyond, lens, vertices, faces,
+        ties, symmetry, rotation, position, scale,
         expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), s.steps,
         np.empty_like(vertices), depth, index, matrix, np.empty((n, n)), np.empty(n), cross, np.empty(n),
         np.empty(POSE),

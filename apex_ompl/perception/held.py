@@ -3,7 +3,8 @@
 Where an object should be follows from the pose of the hand and its grasp, with the spread that grasps have. The
 robot's own surface corrects the camera (:mod:`apex_ompl.perception.registration`) and tells which pixels are the
 robot's. The object's surface is fitted to the others (:mod:`apex_ompl.kernel.perception`), from several starts. The
-covariance holds the noise, the spread of grasps, the camera's remaining error, and other minima of nearly the same cost.
+covariance holds the noise, the spread of grasps, the camera's remaining error, and other minima of nearly the same
+cost.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
 INFLATION = {"box": 1.4, "cylinder": 1.1, "capsule": 1.1, "sphere": 1.0, "mesh": 1.6, "thin mesh": 1.1}
-"""Factors of the variances of measurements by shape, and of means of frames, which leave out what flies between surfaces.
+"""Factors of the variances of measurements by shape, and of means of frames, which leave out flying pixels.
 
 They make mean normalized squared errors those of chi-squared on scenes of their own (``python -m
 benchmarks.perception.held --calibrate``).
@@ -119,35 +120,83 @@ class HeldObject:
     """Where a held object is, or why that is not known.
 
     Attributes:
-        name: Name of the object.
+        body: The object as it was expected.
         reason: Why there is no answer, as a sentence; empty where there is one. Pose and covariance are then those that
             the grasp alone gives.
         pose: Pose in the world, shape (4, 4) [m].
+        covariance: Of a turn about the object's origin and a shift, both in the axes of the world, shape (6, 6)
+            [rad, m].
         scale: Factors of the sizes along the axes of the object, shape (3,).
-        covariance: Of a turn about the object's origin and a shift, both in the axes of the world, [rad, m], shape (6, 6).
         size_spread: Standard deviation of the logarithms of the scales, shape (3,).
-        face: Center of the contact face in the world, shape (3,) [m].
-        axis: Its outward axis, a unit vector, shape (3,).
-        face_spread: Standard deviation of the face's center, root of the sum over the axes [m].
-        axis_spread: Standard deviation of the axis, root of the sum over both directions [rad].
         seen: Share of the object's outline that was measured.
         points: Number of pixels that may be the object's.
         misfit: Mean robust squared error of its points over what noise explains; infinite without an answer.
     """
 
-    name: str
+    body: AttachedObject
     reason: str
     pose: Array
-    scale: Array
     covariance: Array
-    size_spread: Array
-    face: Array
-    axis: Array
-    face_spread: float
-    axis_spread: float
-    seen: float
-    points: int
-    misfit: float
+    scale: Array = field(default_factory=lambda: np.ones(3))
+    size_spread: Array = field(default_factory=lambda: np.zeros(3))
+    seen: float = 0.0
+    points: int = 0
+    misfit: float = np.inf
+
+    @property
+    def name(self) -> str:
+        """Name of the object."""
+        return self.body.name
+
+    @property
+    def face(self) -> Array:
+        """Center of the contact face in the world, or of the object where it has none, shape (3,) [m]."""
+        return np.asarray(self.pose[:3, :3] @ self._point + self.pose[:3, 3])
+
+    @property
+    def axis(self) -> Array:
+        """Outward axis of the contact face, or z where it has none, a unit vector, shape (3,)."""
+        axis = self.pose[:3, :3] @ np.array(self.body.contact.axis if self.body.contact else (0.0, 0.0, 1.0), float)
+        return np.asarray(axis / np.linalg.norm(axis))
+
+    @property
+    def face_covariance(self) -> Array:
+        """Covariance of the center of the contact face, shape (3, 3) [m^2]."""
+        rotation = self.pose[:3, :3]
+        moved = np.hstack([-pin.skew(rotation @ self._point), np.eye(3)])
+        grown = rotation * (self.size_spread * self._point)
+        return np.asarray(moved @ self.covariance @ moved.T + grown @ grown.T)
+
+    @property
+    def face_spread(self) -> float:
+        """Standard deviation of the center of the contact face, root of the sum over the axes [m]."""
+        return float(np.sqrt(np.trace(self.face_covariance)))
+
+    @property
+    def axis_spread(self) -> float:
+        """Standard deviation of the axis, root of the sum over both directions [rad]."""
+        turn = pin.skew(self.axis)
+        return float(np.sqrt(np.trace(turn @ self.covariance[:3, :3] @ turn.T)))
+
+    @property
+    def _point(self) -> Array:
+        return np.array(self.body.contact.point if self.body.contact else (0.0, 0.0, 0.0)) * self.scale
+
+
+class _Region(NamedTuple):
+    """What a fit is made from.
+
+    Attributes:
+        window: Part of the image.
+        prior: Information before, shape (6, 6) or (9, 9).
+        share: Independent measurements, over all points.
+        pixels: Number of pixels that may be the object's.
+    """
+
+    window: Window
+    prior: Array
+    share: float
+    pixels: int
 
 
 class Expected(NamedTuple):
@@ -202,11 +251,12 @@ class HeldObjectFinder:
         s = self.settings
         spread = np.diag([*np.radians(s.grasp_turn), *s.grasp_shift]) ** 2
         found = []
-        for body, *about in zip(
+        for body, surface, ties, symmetry, inflation in zip(
             self.attached, self._surfaces, self._ties, self._symmetries, self._inflations, strict=True
         ):
             link = self.robot.link_pose(state, body.link)
-            found.append(Expected(body, *about, link @ body.pose, turned(spread, link[:3, :3])))
+            covariance = turned(spread, link[:3, :3])
+            found.append(Expected(body, surface, ties, symmetry, inflation, link @ body.pose, covariance))
         return found
 
     def by_grasp(self, frame: Frame) -> tuple[HeldObject, ...]:
@@ -262,20 +312,20 @@ class HeldObjectFinder:
         )
         count = len(points) * window.stride**2
         if count < s.least_points:
-            return _without(one, _nothing_seen(one, measured, window, robot, center, radius), count)
+            around = measured[_cells(window)]
+            return _without(one, _nothing_seen(one.body.name, around, robot, center[2] - radius), count)
         kept = points[np.linspace(0, len(points) - 1, min(len(points), s.most_points)).astype(np.int64)]
         settings = self._fit_settings(one, seen, window, len(points) / len(kept))
-        prior = np.linalg.inv(turned(one.covariance, registration.pose[:3, :3].T))
+        prior = np.asarray(np.linalg.inv(turned(one.covariance, registration.pose[:3, :3].T)), float)
         if s.size_spread > 0.0:
             sizes = np.where(np.isin(range(3), one.ties), s.size_spread**-2, UNKNOWN)
             prior = np.block([[prior, np.zeros((6, 3))], [np.zeros((3, 6)), np.diag(sizes)]])
         fits = [
-            fit_surface(kept, beyond, own, one.surface.vertices, one.surface.faces, one.ties, one.symmetry, start, expected, prior,
-                        settings)
+            fit_surface(kept, beyond, own, one.surface.vertices, one.surface.faces, one.ties, one.symmetry, start,
+                        expected, prior, settings)
             for start in self._starts(one, expected, registration)
         ]  # fmt: skip
-        misfit = min(fit.cost for fit in fits) / (settings.point_share * len(kept))
-        return self._answer(one, fits, prior, misfit, measured, window, registration, count)
+        return self._answer(one, fits, seen, _Region(window, prior, settings.point_share * len(kept), count))
 
     def _fit_settings(self, one: Expected, seen: CorrectedFrame, window: Window, thinning: float) -> FitSettings:
         """Return the weights of points that stand for others, of pixels that share their noise in patches."""
@@ -300,16 +350,18 @@ class HeldObjectFinder:
         return starts
 
     def _answer(
-        self, one: Expected, fits: list[SurfaceFit], prior: Array, misfit: float, measured: Array, window: Window,
-        registration: Registration, count: int,
+        self, one: Expected, fits: list[SurfaceFit], seen: CorrectedFrame, region: _Region
     ) -> HeldObject:  # fmt: skip
+        registration, prior, count = seen.registration, region.prior, region.pixels
         best = min(fits, key=lambda fit: fit.cost)
         if not np.isfinite(best.cost):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
+        misfit = best.cost / region.share
         if misfit > self.settings.most_misfit:
             return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
         factor = max(1.0, misfit / MISFIT) ** 2  # of the variances of measurements
-        covariance, n = np.zeros_like(best.information), len(best.information)
+        n = len(best.information)
+        covariance: Array = np.zeros((n, n))
         weights = np.exp(-0.5 * np.array([fit.cost - best.cost for fit in fits]))
         for fit, weight in zip(fits, weights / weights.sum(), strict=True):
             if weight < 1e-3:
@@ -319,17 +371,17 @@ class HeldObjectFinder:
             away = np.zeros(n)
             away[:3] = pin.log3(fit.rotation @ best.rotation.T)
             away[3:6] = fit.position - best.position
-            covariance += weight * (own + lever @ registration.covariance @ lever.T + np.outer(away, away))
-        pose, scale = np.eye(4), best.scale
+            covariance = covariance + weight * (own + lever @ registration.covariance @ lever.T + np.outer(away, away))
+        pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = best.rotation, best.position
-        seen, missed = _measured_shares(best, measured, window)
-        if missed > seen:
+        share, missed = _measured_shares(best, seen.depth[_cells(region.window)])
+        if missed > share:
             return _without(one, f"{one.body.name!r}: no surface is seen where the hand holds it", count)
-        if seen < self.settings.least_seen:
-            return _without(one, f"{one.body.name!r} is hidden: {100 * seen:.0f} % of it can be seen", count)
-        world = turned(covariance[:6, :6], registration.pose[:3, :3])
+        if share < self.settings.least_seen:
+            return _without(one, f"{one.body.name!r} is hidden: {100 * share:.0f} % of it can be seen", count)
         size = np.sqrt(np.diag(covariance)[6:][one.ties]) if n > 6 else np.zeros(3)
-        return _described(one.body, "", registration.pose @ pose, scale, world, size, seen, count, misfit)
+        world = turned(covariance[:6, :6], registration.pose[:3, :3])
+        return HeldObject(one.body, "", registration.pose @ pose, world, best.scale, size, share, count, misfit)
 
 
 def turned(covariance: Array, rotation: Array) -> Array:
@@ -356,55 +408,42 @@ def window_around(center: Array, radius: float, camera: Camera) -> Window | None
     return Window(left, top, (right - left) // stride, (bottom - top) // stride, stride)
 
 
-def _measured_shares(fit: SurfaceFit, measured: Array, window: Window) -> tuple[float, float]:
+def _measured_shares(fit: SurfaceFit, around: Array) -> tuple[float, float]:
     """Return the shares of the drawn object at whose pixels its surface was measured, and where it was seen through."""
-    there = fit.index >= 0
-    rows = window.top + window.stride * np.arange(window.height)
-    columns = window.left + window.stride * np.arange(window.width)
-    depth = measured[np.ix_(rows, columns)][there]
+    there = fit.triangle >= 0
+    depth = around[there]
     if not depth.size:
         return 0.0, 0.0
     farther = depth - fit.depth[there]
     return float((np.abs(farther) < SAME).mean()), float((farther > FARTHER).mean())
 
 
-def _nothing_seen(
-    one: Expected, measured: Array, window: Window, robot: Array, center: Array, radius: float
-) -> str:  # fmt: skip
-    """Return why there are no points of an object, as a sentence."""
-    part = measured[
-        window.top : window.top + window.height * window.stride,
-        window.left : window.left + window.width * window.stride,
-    ]
-    name = repr(one.body.name)
-    if np.mean(part > 0.0) < 0.3:
-        return f"{name}: {100 * np.mean(part == 0.0):.0f} % of the image around it have no depth"
-    if np.mean(part[part > 0.0] < center[2] - radius) > 0.3 or np.mean(np.isfinite(robot)) > 0.5:
-        return f"{name} is hidden: the camera sees other surfaces before it"
-    return f"{name}: no surface is seen where the hand holds it"
+def _cells(window: Window) -> tuple[slice, slice]:
+    """Return the rows and columns of a window."""
+    height, width = window.height * window.stride, window.width * window.stride
+    return (
+        slice(window.top, window.top + height, window.stride), slice(window.left, window.left + width, window.stride)
+    )  # fmt: skip
+
+
+def _nothing_seen(name: str, depth: Array, robot: Array, front: float) -> str:
+    """Return why there are no points of an object, as a sentence.
+
+    Args:
+        name: Its name.
+        depth: Depths around it [m].
+        robot: Expected depths of the robot there [m].
+        front: Depth where it begins [m].
+    """
+    if np.mean(depth > 0.0) < 0.3:
+        return f"{name!r}: {100 * np.mean(depth == 0.0):.0f} % of the image around it have no depth"
+    if np.mean(depth[depth > 0.0] < front) > 0.3 or np.mean(np.isfinite(robot)) > 0.5:
+        return f"{name!r} is hidden: the camera sees other surfaces before it"
+    return f"{name!r}: no surface is seen where the hand holds it"
 
 
 def _without(one: Expected, reason: str, count: int = 0) -> HeldObject:
-    return _described(one.body, reason, one.pose, np.ones(3), one.covariance, np.zeros(3), 0.0, count, np.inf)
-
-
-def _described(
-    body: AttachedObject, reason: str, pose: Array, scale: Array, covariance: Array, size_spread: Array, seen: float,
-    points: int, misfit: float,
-) -> HeldObject:  # fmt: skip
-    """Return the answer with its contact face."""
-    contact = body.contact
-    point = np.array(contact.point if contact else (0.0, 0.0, 0.0)) * scale
-    direction = np.array(contact.axis if contact else (0.0, 0.0, 1.0), float)
-    arm, axis = pose[:3, :3] @ point, pose[:3, :3] @ (direction / np.linalg.norm(direction))
-    to_face = np.hstack([-pin.skew(arm), np.eye(3)])
-    face = to_face @ covariance @ to_face.T
-    face += np.diag((pose[:3, :3] ** 2) @ (size_spread * point) ** 2)
-    turn = pin.skew(axis)
-    return HeldObject(
-        body.name, reason, pose, scale, covariance, size_spread, pose[:3, 3] + arm, axis,
-        float(np.sqrt(np.trace(face))), float(np.sqrt(np.trace(turn @ covariance[:3, :3] @ turn.T))), seen, points, misfit,
-    )  # fmt: skip
+    return HeldObject(one.body, reason, one.pose, one.covariance, points=count)
 
 
 def _ties(body: AttachedObject, surface: Surface) -> Indices:

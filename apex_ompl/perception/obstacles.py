@@ -382,8 +382,10 @@ class ObstacleFinder:
         s = self.settings
         shared = max(1.0, (seen.camera.depth.correlation / patch.window.stride) ** 2)
         return FitSettings(
-            noise=seen.noise, floor=s.floor, edge=s.edge, point_share=s.point_share * thinning / shared / s.inflation,
-            contour_share=s.contour_share * patch.window.stride / s.inflation, first=0.04, last=0.02, reach=0.02, steps=12,
+            noise=seen.noise, floor=s.floor, edge=s.edge,
+            point_share=s.point_share * thinning / shared / s.inflation,
+            contour_share=s.contour_share * patch.window.stride / s.inflation, first=0.04, last=0.02, reach=0.02,
+            steps=12,
         )  # fmt: skip
 
 

@@ -66,6 +66,22 @@ class Registration(NamedTuple):
     pixels: int
 
 
+class CorrectedFrame(NamedTuple):
+    """Depths of a pinhole with the corrections of a registration.
+
+    Attributes:
+        camera: The camera.
+        depth: Depths, 0 where there is none, shape (height, width) [m].
+        registration: The corrections.
+        noise: Standard deviation of depth z is ``noise`` z^2 [1/m].
+    """
+
+    camera: Camera
+    depth: Array
+    registration: Registration
+    noise: float
+
+
 def spreads_of(surface: RobotSurface, settings: RegistrationSettings) -> dict[int, float]:
     """Return the joints that may differ from what is reported, by their index in a state, with standard deviations."""
     robot = surface.robot
@@ -75,24 +91,18 @@ def spreads_of(surface: RobotSurface, settings: RegistrationSettings) -> dict[in
     return {robot.joint_names.index(name): spread for name, spread in given.items()}
 
 
-def register(
-    measured: Array, camera: Camera, pose: Array, surface: RobotSurface, state: Array, settings: RegistrationSettings,
-    noise: float,
-) -> Registration:  # fmt: skip
+def register(given: CorrectedFrame, surface: RobotSurface, settings: RegistrationSettings) -> Registration:
     """Correct the pose of a camera, the scale of its depths, and joints, by the robot's surface.
 
     Residuals are distances of measured points from the tangent planes of the expected surface (point to plane), with
     Tukey's weights; the errors that the camera's file expects are the prior.
 
     Args:
-        measured: Depths of a pinhole, 0 where there is none, shape (height, width) [m].
-        camera: The camera.
-        pose: Reported pose of the optical frame in the world, shape (4, 4) [m].
+        given: Depths with the pose and the state that were reported.
         surface: The robot's surface.
-        state: Reported state, shape (dof,).
         settings: The settings.
-        noise: Standard deviation of depth z is ``noise`` z^2 [1/m].
     """
+    camera, measured, (pose, _, state, *_), noise = given
     joints = spreads_of(surface, settings)
     spreads = [camera.angle_spread] * 3 + [camera.position_spread] * 3 + [camera.depth.scale_spread, *joints.values()]
     prior = np.diag(1.0 / np.maximum(spreads, 1e-6) ** 2)
@@ -124,22 +134,6 @@ def register(
     return Registration(found, 1.0 + float(unknowns[6]), corrected, covariance[:POSE, :POSE], count)
 
 
-class CorrectedFrame(NamedTuple):
-    """Depths of a pinhole with the corrections of a registration.
-
-    Attributes:
-        camera: The camera.
-        depth: Depths, 0 where there is none, shape (height, width) [m].
-        registration: The corrections.
-        noise: Standard deviation of depth z is ``noise`` z^2 [1/m].
-    """
-
-    camera: Camera
-    depth: Array
-    registration: Registration
-    noise: float
-
-
 def corrected(
     frame: Frame, surface: RobotSurface, settings: RegistrationSettings | None, frames: int = 1
 ) -> CorrectedFrame:
@@ -158,9 +152,10 @@ def corrected(
     noise = camera.depth.noise / float(np.sqrt(frames))
     depth = resampled(frame.depth, undistorted(camera)) * camera.depth.scale
     depth = np.where(depth >= camera.depth.nearest, depth, 0.0)
-    pose = camera.pose_at(surface.robot, state)
+    spreads = [camera.angle_spread] * 3 + [camera.position_spread] * 3 + [camera.depth.scale_spread]
+    reported = Registration(camera.pose_at(surface.robot, state), 1.0, state, np.diag(spreads) ** 2, 0)
+    given = CorrectedFrame(camera, depth, reported, noise)
     if settings is None:
-        spreads = [camera.angle_spread] * 3 + [camera.position_spread] * 3 + [camera.depth.scale_spread]
-        return CorrectedFrame(camera, depth, Registration(pose, 1.0, state, np.diag(spreads) ** 2, 0), noise)
-    found = register(depth, camera, pose, surface, state, settings, noise)
+        return given
+    found = register(given, surface, settings)
     return CorrectedFrame(camera, depth * found.scale, found, noise)

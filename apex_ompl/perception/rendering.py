@@ -108,7 +108,7 @@ def _flat(pixels: Array, camera: Camera) -> Indices:
     return np.where(inside, nearest[..., 1] * camera.width + nearest[..., 0], -1)
 
 
-def resampled(image: Array, flat: Indices | None) -> Array:
+def resampled(image: NDArray[Any], flat: Indices | None) -> NDArray[Any]:
     """Return an image with the pixels at given places, 0 at -1; the image itself for None."""
     if flat is None:
         return image
@@ -245,8 +245,8 @@ def _seen_through(camera: Camera, view: View) -> View:
 class DepthSensor:
     """Noise of a stereo camera's depths.
 
-    Depths have correlated errors that grow with z^2, are missing or between both sides at edges, missing where the second
-    imager does not see the surface, and whole millimeters.
+    Depths have correlated errors that grow with z^2, are missing or between both sides at edges, missing where the
+    second imager does not see the surface, and whole millimeters.
 
     Attributes:
         baseline: Distance of the imagers [m].

@@ -6,7 +6,6 @@ pose of the camera, and its depths.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +13,7 @@ from typing import Any, Literal
 import coal
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.perception.camera import Camera, DepthErrors, look_at
@@ -63,7 +63,7 @@ KINDS = {
 
 
 def held_object(
-    kind: str, size: Sequence[float], palm: str, side: int, name: str, meshes: Path
+    kind: str, size: ArrayLike, palm: str, side: int, *, name: str, meshes: Path
 ) -> AttachedObject:  # fmt: skip
     """Return an object of a kind in a palm, its contact face (+z) on the little finger's side.
 
@@ -75,7 +75,7 @@ def held_object(
         name: Name of the object.
         meshes: Folder of ``cup.obj`` and ``block.obj``, as the ready-made problems have them.
     """
-    a, b, c = map(float, size)
+    a, b, c = np.asarray(size, float).tolist()
     nominal = KINDS[kind]
     scale = tuple(float(v) for v in np.array([a, b, c]) / nominal.size)
     shapes: dict[str, dict[str, Any]] = {
@@ -270,7 +270,7 @@ class SceneGenerator:
             Frame(camera, depth, colors(view, parts, light, rng) if given.colors else None, 0.1 * t, joints)
             for t, depth in enumerate(depths)
         )
-        objects = tuple(self._truth(one, HELD + k, view, camera, pose, there[k]) for k, one in enumerate(held))
+        objects = tuple(self._truth(one, HELD + k, view, camera, pose, there=there[k]) for k, one in enumerate(held))
         obstacle = None
         if given.obstacle is not None and solid is not None:
             whole = self._outline(solid[0], solid[1], camera, pose)
@@ -306,15 +306,15 @@ class SceneGenerator:
     def _object(
         self, rng: np.random.Generator, settings: SyntheticSettings, hand: str, side: int, state: Array
     ) -> tuple[str, AttachedObject, str, AttachedObject, Array, Array]:
-        """Return the hand, the object as it is, its kind, the object as reported, its pose in the world, and its size."""
+        """Return the hand, the object as it is, its kind, the object as reported, its pose in the world, its size."""
         kind = list(KINDS)[rng.integers(len(KINDS))]
         size = np.array(KINDS[kind].size) * rng.uniform(0.85, 1.15)
         if kind in ("box", "can", "peg", "cup"):
             size[2] *= rng.uniform(0.9, 1.1)
         palm = self.robot.hands[hand].palm
-        body = held_object(kind, size, palm, side, kind, self._meshes)
+        body = held_object(kind, size, palm, side, name=kind, meshes=self._meshes)
         factors = np.exp(rng.normal(0.0, settings.size_spread, 3))[list(TIES[kind])]
-        reported = held_object(kind, size * factors, palm, side, kind, self._meshes).model_copy(
+        reported = held_object(kind, size * factors, palm, side, name=kind, meshes=self._meshes).model_copy(
             update={"position": body.position}
         )
         state[self._synergy(hand)] = KINDS[kind].synergy
@@ -362,7 +362,7 @@ class SceneGenerator:
 
     def _truth(
         self, held: tuple[str, AttachedObject, str, AttachedObject, Array, Array], label: int, view: View,
-        camera: Camera, pose: Array, there: bool,
+        camera: Camera, pose: Array, *, there: bool,
     ) -> TrueObject:  # fmt: skip
         _, body, kind, reported, at, size = held
         alone = ZBuffer().draw([solid_part(coal_geometry(body), at, label, (1.0, 1.0, 1.0))], camera, pose)
@@ -380,7 +380,7 @@ TIES = {"box": (0, 1, 2), "can": (0, 0, 2), "peg": (0, 0, 2), "cup": (0, 0, 2), 
 
 
 def random_error(rng: np.random.Generator, shift: float, turn: float) -> Array:
-    """Return a pose with a shift of exactly this length [m] and a turn of exactly this angle [degrees], shape (4, 4)."""
+    """Return a pose with a shift of this length [m] and a turn of this angle [degrees], shape (4, 4)."""
     found = np.eye(4)
     found[:3, :3] = pin.exp3(np.radians(turn) * _unit(rng.normal(size=3)))
     found[:3, 3] = shift * _unit(rng.normal(size=3))

@@ -362,13 +362,14 @@ OTHERS: Functions = {
     ),
     "perception.surface_fit.fit_surface": (
         "f8[:, ::1], i8, f8[:, ::1], f8[::1], f8[:, ::1], i8[:, ::1], i8[::1], i8, f8[:, ::1], f8[::1], f8[::1], "
-        "f8[:, ::1], f8[::1], f8[:, ::1], Tuple((f8, f8, f8, f8, f8, f8, f8, f8)), i8, f8[:, ::1], f8[:, ::1], i8[:, ::1], "
+        "f8[:, ::1], f8[::1], f8[:, ::1], Tuple((f8, f8, f8, f8, f8, f8, f8, f8)), i8, f8[:, ::1], f8[:, ::1], "
+        "i8[:, ::1], "
         "f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]",
         3,
     ),
     "geometry.triangles.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }
-"""What point clouds, grids, inverse kinematics, roadmaps, trainings and perception call; without the library, compiled at need."""
+"""What point clouds, grids, kinematics, roadmaps, trainings and perception call; without the library, compiled at need."""
 
 ALL: Functions = {**PLANS.functions, **RUNS.functions, **CONSTRAINED.functions, **OTHERS}
 """All functions that Python calls."""

@@ -1,8 +1,8 @@
 """Depth images of triangles, drawn by a z-buffer with homogeneous edge functions, which need no clipping.
 
 A ray d = (x, y, 1) through a pixel meets the triangle a, b, c where d . (b x c), d . (c x a) and d . (a x b) have the
-sign of det(a, b, c), at the depth det(a, b, c) / (the sum of the three) (Olano, Greer: Triangle scan conversion using 2D
-homogeneous coordinates, 1997).
+sign of det(a, b, c), at the depth det(a, b, c) / (the sum of the three) (Olano, Greer: Triangle scan conversion using
+2D homogeneous coordinates, 1997).
 """
 
 from __future__ import annotations

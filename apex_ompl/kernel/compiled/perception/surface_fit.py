@@ -30,7 +30,8 @@ def select_points(
 ) -> int:  # fmt: skip
     """Put the points of a ball that are not the robot's into place, and the distances of pixels from the covered ones.
 
-    An object may cover pixels with a point of the ball or of the robot, without depth, or with anything before the ball.
+    An object may cover pixels with a point of the ball or of the robot, without depth, or with a surface before
+    the ball.
 
     Args:
         measured: Depths of the whole image, shape (height, width) [m].
@@ -266,8 +267,8 @@ def fit_surface(
         prior_position: Expected origin, shape (3,) [m].
         prior: Information of turn and shift from there, and of logarithms of the scales, shape (n, n); scales are
             unknown where n is 9, and known where it is 6.
-        settings: Noise of depth z over z^2 [1/m], error of surfaces [m], error of the contour [pixels], information of a
-            point and of a pixel of the contour, largest residual at the start and in the end [m], and that of the
+        settings: Noise of depth z over z^2 [1/m], error of surfaces [m], error of the contour [pixels], information of
+            a point and of a pixel of the contour, largest residual at the start and in the end [m], and that of the
             contour [m].
         steps: Number of steps.
         placed: Room, shape (V, 3).
@@ -280,110 +281,158 @@ def fit_surface(
         row: Room, shape (n,).
         camera: Room, shape (7,).
     """
-    n, cost = len(vector), math.inf
-    noise, floor, edge, point_share, contour_share, first, last, reach = settings
-    height, width = index.shape
+    cost = math.inf
+    first, last = settings[5], settings[6]
     for step in range(steps + 1):
-        for k in range(len(vertices)):
-            x, y, z = scale[0] * vertices[k, 0], scale[1] * vertices[k, 1], scale[2] * vertices[k, 2]
-            for r in range(3):
-                placed[k, r] = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z + position[r]
-        for i in range(height):
-            for j in range(width):
+        _place(vertices, rotation, position, scale, placed)
+        for i in range(index.shape[0]):
+            for j in range(index.shape[1]):
                 index[i, j] = -1
         draw(placed, faces, lens, depth, index)
-        cost = 0.0
-        for k in range(n):
+        _copy(prior, matrix)
+        for k in range(len(vector)):
             vector[k] = 0.0
-            for m in range(n):
-                matrix[k, m] = prior[k, m]
             for m in range(CAMERA):
                 cross[k, m] = 0.0
         cutoff = max(last, first * 0.7**step) if step < steps else last
-        for p in range(len(points)):
-            x, y, z = points[p, 0], points[p, 1], points[p, 2]
-            column, line = round(lens[0] * x / z + lens[2]), round(lens[1] * y / z + lens[3])
-            inside = 0 <= line < height and 0 <= column < width
-            k = index[line, column] if inside else -1
-            seen = k >= 0
-            if seen and p >= outline:
-                continue
-            share, largest = (point_share, cutoff) if p < outline else (contour_share, max(cutoff, reach))
-            apart = 0.0
-            if inside and not seen:
-                k, apart = _seen_beside(index, line, column)
-            if k < 0:
-                cost += share / 3.0 * (last / (noise * z * z + floor)) ** 2
-                continue
-            a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
-            if seen:
-                nx, ny, nz = unit_normal(placed, a, b, c)
-                r = nx * (x - placed[a, 0]) + ny * (y - placed[a, 1]) + nz * (z - placed[a, 2])
-            else:
-                qx, qy, qz = _closest(placed, a, b, c, x, y, z)
-                if p >= outline:  # at the depth of the surface
-                    x, y, z = x * qz / z, y * qz / z, qz
-                    qx, qy, qz = _closest(placed, a, b, c, x, y, z)
-                nx, ny, nz = x - qx, y - qy, z - qz
-                r = math.sqrt(nx * nx + ny * ny + nz * nz)
-                if r < 1e-9:
-                    continue
-                nx, ny, nz = nx / r, ny / r, nz / r
-                if p >= outline:  # as far as the outline is from a pixel that it covers too much
-                    r = (apart - 0.5) * z / lens[0]
-            distance = math.sqrt(x * x + y * y + z * z)
-            cosine = (nx * x + ny * y + nz * z) / distance
-            across = edge * z / lens[0]
-            variance = noise * noise * z * z * z * z * cosine * cosine + floor * floor
-            variance += across * across * (1.0 - cosine * cosine)
-            weight, loss = _robust(r, largest)
-            cost += share * loss * largest * largest / variance
-            if weight == 0.0:
-                continue
-            _surface_row(row, rotation, position, ties, symmetry, x - r * nx, y - r * ny, z - r * nz, -nx, -ny, -nz)
-            camera[0], camera[1], camera[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-            camera[3], camera[4], camera[5], camera[6] = nx, ny, nz, nx * x + ny * y + nz * z
-            _add(matrix, vector, cross, row, camera, share * weight / variance, r)
-        for i in range(1, height - 1):
-            for j in range(1, width - 1):
-                if index[i, j] < 0 or beyond[i, j] == 0.0:
-                    continue
-                if index[i - 1, j] >= 0 and index[i + 1, j] >= 0 and index[i, j - 1] >= 0 and index[i, j + 1] >= 0:
-                    continue
-                gu, gv = (beyond[i, j + 1] - beyond[i, j - 1]) / 2.0, (beyond[i + 1, j] - beyond[i - 1, j]) / 2.0
-                if not (math.isfinite(gu) and math.isfinite(gv)):
-                    continue
-                z = depth[i, j]
-                x, y = (j - lens[2]) / lens[0] * z, (i - lens[3]) / lens[1] * z
-                pixel = z / lens[0]
-                r = (beyond[i, j] - 0.5) * pixel  # the border is between the centers of pixels
-                weight, loss = _robust(r, reach)
-                variance = edge * edge * pixel * pixel + floor * floor
-                cost += contour_share * loss * reach * reach / variance
-                if weight == 0.0:
-                    continue
-                gz = -(gu * x + gv * y) / z
-                _surface_row(row, rotation, position, ties, symmetry, x, y, z, gu, gv, gz)
-                camera[0], camera[1], camera[2] = -(y * gz - z * gv), -(z * gu - x * gz), -(x * gv - y * gu)
-                camera[3], camera[4], camera[5], camera[6] = -gu, -gv, -gz, 0.0
-                _add(matrix, vector, cross, row, camera, contour_share * weight / variance, r)
+        cost = _add_points(
+            points, outline, lens, faces, ties, symmetry, rotation, position, settings, cutoff, placed, index, matrix,
+            vector, cross, row, camera,
+        )  # fmt: skip
+        cost += _add_contour(
+            beyond, lens, ties, symmetry, rotation, position, settings, depth, index, matrix, vector, cross, row, camera
+        )
         cost += _add_prior(matrix, vector, prior, rotation, position, scale, ties, prior_rotation, prior_position, row)
         if step == steps:
             break
-        for k in range(n):
-            for m in range(n):
-                factor[k, m] = matrix[k, m]
+        _copy(matrix, factor)
         if not _solve(factor, vector):
             return math.inf
-        angle = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
-        length = min(1.0, LARGEST_TURN / max(angle, 1e-12))
-        for k in range(6, n):
-            length = min(length, LARGEST_GROWTH / max(abs(vector[k]), 1e-12))
-        _turn(rotation, length * vector[0], length * vector[1], length * vector[2])
-        for k in range(3):
-            position[k] += length * vector[3 + k]
-            if n > 6:
-                scale[k] *= math.exp(length * vector[6 + ties[k]])
+        _move(vector, rotation, position, scale, ties)
+    return cost
+
+
+@inlined
+def _copy(source: Floats, target: Floats) -> None:
+    """Copy a matrix."""
+    for k in range(source.shape[0]):
+        for m in range(source.shape[1]):
+            target[k, m] = source[k, m]
+
+
+@inlined
+def _place(vertices: Floats, rotation: Floats, position: Floats, scale: Floats, placed: Floats) -> None:
+    """Put the vertices of the scaled surface into the optical frame."""
+    for k in range(len(vertices)):
+        x, y, z = scale[0] * vertices[k, 0], scale[1] * vertices[k, 1], scale[2] * vertices[k, 2]
+        for r in range(3):
+            placed[k, r] = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z + position[r]
+
+
+@inlined
+def _move(step: Floats, rotation: Floats, position: Floats, scale: Floats, ties: Integers) -> None:
+    """Take a step, or the part of it that turns and grows by no more than is allowed."""
+    n = len(step)
+    angle = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    length = min(1.0, LARGEST_TURN / max(angle, 1e-12))
+    for k in range(6, n):
+        length = min(length, LARGEST_GROWTH / max(abs(step[k]), 1e-12))
+    _turn(rotation, length * step[0], length * step[1], length * step[2])
+    for k in range(3):
+        position[k] += length * step[3 + k]
+        if n > 6:
+            scale[k] *= math.exp(length * step[6 + ties[k]])
+
+
+@outlined
+def _add_points(
+    points: Floats, outline: int, lens: Floats, faces: Integers, ties: Integers, symmetry: int, rotation: Floats,
+    position: Floats, settings: tuple[float, float, float, float, float, float, float, float], cutoff: float,
+    placed: Floats, index: Integers, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+) -> float:  # fmt: skip
+    """Add the residuals of points from the drawn surface to the normal equations, and return their cost."""
+    noise, floor, edge, point_share, contour_share, _, last, reach = settings
+    height, width = index.shape
+    cost = 0.0
+    for p in range(len(points)):
+        x, y, z = points[p, 0], points[p, 1], points[p, 2]
+        column, line = round(lens[0] * x / z + lens[2]), round(lens[1] * y / z + lens[3])
+        inside = 0 <= line < height and 0 <= column < width
+        k = index[line, column] if inside else -1
+        seen = k >= 0
+        if seen and p >= outline:
+            continue
+        share, largest = (point_share, cutoff) if p < outline else (contour_share, max(cutoff, reach))
+        apart = 0.0
+        if inside and not seen:
+            k, apart = _seen_beside(index, line, column)
+        if k < 0:
+            cost += share / 3.0 * (last / (noise * z * z + floor)) ** 2
+            continue
+        a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
+        if seen:
+            nx, ny, nz = unit_normal(placed, a, b, c)
+            r = nx * (x - placed[a, 0]) + ny * (y - placed[a, 1]) + nz * (z - placed[a, 2])
+        else:
+            qx, qy, qz = _closest(placed, a, b, c, x, y, z)
+            if p >= outline:  # at the depth of the surface
+                x, y, z = x * qz / z, y * qz / z, qz
+                qx, qy, qz = _closest(placed, a, b, c, x, y, z)
+            nx, ny, nz = x - qx, y - qy, z - qz
+            r = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if r < 1e-9:
+                continue
+            nx, ny, nz = nx / r, ny / r, nz / r
+            if p >= outline:  # as far as the outline is from a pixel that it covers too much
+                r = (apart - 0.5) * z / lens[0]
+        cosine = (nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
+        across = edge * z / lens[0]
+        variance = noise * noise * z * z * z * z * cosine * cosine + floor * floor
+        variance += across * across * (1.0 - cosine * cosine)
+        weight, loss = _robust(r, largest)
+        cost += share * loss * largest * largest / variance
+        if weight == 0.0:
+            continue
+        _surface_row(row, rotation, position, ties, symmetry, x - r * nx, y - r * ny, z - r * nz, -nx, -ny, -nz)
+        camera[0], camera[1], camera[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
+        camera[3], camera[4], camera[5], camera[6] = nx, ny, nz, nx * x + ny * y + nz * z
+        _add(matrix, vector, cross, row, camera, share * weight / variance, r)
+    return cost
+
+
+@outlined
+def _add_contour(
+    beyond: Floats, lens: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats,
+    settings: tuple[float, float, float, float, float, float, float, float], depth: Floats, index: Integers,
+    matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+) -> float:  # fmt: skip
+    """Add the residuals of the drawing's contour from what may be covered, and return their cost."""
+    _, floor, edge, _, share, _, _, reach = settings
+    height, width = index.shape
+    cost = 0.0
+    for i in range(1, height - 1):
+        for j in range(1, width - 1):
+            if index[i, j] < 0 or beyond[i, j] == 0.0:
+                continue
+            if index[i - 1, j] >= 0 and index[i + 1, j] >= 0 and index[i, j - 1] >= 0 and index[i, j + 1] >= 0:
+                continue
+            gu, gv = (beyond[i, j + 1] - beyond[i, j - 1]) / 2.0, (beyond[i + 1, j] - beyond[i - 1, j]) / 2.0
+            if not (math.isfinite(gu) and math.isfinite(gv)):
+                continue
+            z = depth[i, j]
+            x, y = (j - lens[2]) / lens[0] * z, (i - lens[3]) / lens[1] * z
+            pixel = z / lens[0]
+            r = (beyond[i, j] - 0.5) * pixel  # the border is between the centers of pixels
+            weight, loss = _robust(r, reach)
+            variance = edge * edge * pixel * pixel + floor * floor
+            cost += share * loss * reach * reach / variance
+            if weight == 0.0:
+                continue
+            gz = -(gu * x + gv * y) / z
+            _surface_row(row, rotation, position, ties, symmetry, x, y, z, gu, gv, gz)
+            camera[0], camera[1], camera[2] = -(y * gz - z * gv), -(z * gu - x * gz), -(x * gv - y * gu)
+            camera[3], camera[4], camera[5], camera[6] = -gu, -gv, -gz, 0.0
+            _add(matrix, vector, cross, row, camera, share * weight / variance, r)
     return cost
 
 
