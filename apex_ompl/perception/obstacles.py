@@ -84,7 +84,7 @@ class ObstacleSettings:
     edge: float = 0.5
     point_share: float = 1.4
     contour_share: float = 0.3
-    inflation: float = 1.6
+    inflation: float = 3.2
     most_points: int = 300
 
     def __post_init__(self) -> None:
@@ -308,10 +308,11 @@ class ObstacleFinder:
         beyond = self._cv.distanceTransform((~covered).astype(np.uint8), self._cv.DIST_L2, 5).astype(float)
         cut = rows.min() < 2 or columns.min() < 2 or rows.max() > camera.height - 3 or columns.max() > camera.width - 3
         grid = _points(guess, lens)
-        points = grid[measured]
-        places, normals = self._normals(grid, measured, max(2, round(np.sqrt(len(points)) / 6.0)))
         inner = self._cv.erode(mine.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1) > 0
-        return _Patch(window, points, grid[mine & ~(measured & inner)], beyond, places, normals, bool(cut), pixels)
+        sure = measured & inner  # depths at the border are often wrong
+        points = grid[sure if np.count_nonzero(sure) * stride * stride >= s.least_points else measured]
+        places, normals = self._normals(grid, measured, max(2, round(np.sqrt(len(points)) / 6.0)))
+        return _Patch(window, points, grid[mine & ~sure], beyond, places, normals, bool(cut), pixels)
 
     def _normals(self, grid: Array, measured: Mask, reach: int) -> tuple[Array, Array]:
         """Return smoothed points and normals there by differences over a distance of pixels, both of shape (K, 3)."""
@@ -357,8 +358,8 @@ class ObstacleFinder:
             ties, symmetry = (np.arange(3), 0) if start.kind == "box" else (np.array([0, 0, 2]), AXIS)
             prior = _prior(start.kind)
             fit = fit_surface(
-                points, patch.beyond, lens, surface.vertices * start.size, surface.faces, ties, symmetry, start.pose, start.pose,
-                prior, settings, len(kept),
+                points, patch.beyond, lens, surface.vertices * start.size, surface.faces, ties, symmetry, start.pose,
+                start.pose, prior, settings, len(kept),
             )  # fmt: skip
             if np.isfinite(fit.cost):
                 fits.append((start, fit))

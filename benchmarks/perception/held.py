@@ -1,14 +1,14 @@
 """Held objects found by fit on synthetic frames: errors, covariances, and time.
 
-Scenes are states of the suites' robot with a box, can, cup, ball, block or peg in each hand, seen from 1 to 1.5 m. What
-is reported differs from the truth: grasps by standard deviations of (8, 8, 3) mm and (4, 4, 10) degrees, closings of the
-fingers by 0.05, the camera by 2 mm and 0.2 degrees, the scale of depth by 0.3 %. Depths have noise of 3.8 mm at 1 m that
-4 x 4 pixels share for the most part, no values at edges and in shadows of the second imager, and patches without any.
-Of a ball errors are those of its center. "nine frames" have noise of their own, the robot at rest. Objects whose center
-is outside the image do not count. "share" is that of objects with an answer; of "gate" that of objects whose own
-standard deviations are at most 4.5 mm and 2.2 degrees, too. "squared" is the mean of normalized squared errors over their
-6 dimensions with its 95 % band by chi-squared, "within" the share of objects within the 95 % ellipsoid. In brackets:
-each seed. Times are CPU times of a frame with both hands, on one core.
+Scenes are states of the suites' robot with a box, can, cup, ball, block or peg in each hand, seen from 1 to 1.5 m.
+What is reported differs from the truth: grasps by standard deviations of (8, 8, 3) mm and (4, 4, 10) degrees,
+closings of the fingers by 0.05, the camera by 2 mm and 0.2 degrees, the scale of depth by 0.3 %. Depths have noise of
+3.8 mm at 1 m that 4 x 4 pixels share for the most part, no values at edges and in shadows of the second imager, and
+patches without any. Of a ball errors are those of its center. "nine frames" have noise of their own, the robot at
+rest. Objects whose center is outside the image do not count. "share" is that of objects with an answer; of "gate"
+that of objects whose own standard deviations are at most 4.5 mm and 2.2 degrees, too. "squared" is the mean of
+normalized squared errors over their 6 dimensions with its 95 % band by chi-squared, "within" the share of objects
+within the 95 % ellipsoid. In brackets: each seed. Times are CPU times of a frame with both hands, on one core.
 
 Usage: python -m benchmarks.perception.held [-n 150] [--calibrate]
 """
@@ -184,7 +184,8 @@ def covariance_rows(found: Sequence[Sample]) -> list[list[Any]]:
             share, slack = float(np.mean(squared < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / len(squared))
             rows.append(
                 [method, kind, len(squared), f"{squared.mean() / DIMENSIONS:.2f}", f"{low:.2f} to {high:.2f}",
-                 f"{np.median(squared) / MEDIAN:.2f}", f"{share:.3f}", f"{0.95 - slack:.3f} to {min(1, 0.95 + slack):.3f}"]
+                 f"{np.median(squared) / MEDIAN:.2f}", f"{share:.3f}",
+                 f"{0.95 - slack:.3f} to {min(1.0, 0.95 + slack):.3f}"]
             )  # fmt: skip
     return rows
 

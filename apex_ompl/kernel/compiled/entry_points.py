@@ -369,7 +369,7 @@ OTHERS: Functions = {
     ),
     "geometry.triangles.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }
-"""What point clouds, grids, kinematics, roadmaps, trainings and perception call; without the library, compiled at need."""
+"""What point clouds, grids, kinematics, roadmaps, trainings, perception call; without the library, compiled at need."""
 
 ALL: Functions = {**PLANS.functions, **RUNS.functions, **CONSTRAINED.functions, **OTHERS}
 """All functions that Python calls."""

@@ -300,8 +300,9 @@ def fit_surface(
             vector, cross, row, camera,
         )  # fmt: skip
         cost += _add_contour(
-            beyond, lens, ties, symmetry, rotation, position, settings, depth, index, matrix, vector, cross, row, camera
-        )
+            beyond, outline < len(points), lens, ties, symmetry, rotation, position, settings, depth, index, matrix,
+            vector, cross, row, camera,
+        )  # fmt: skip
         cost += _add_prior(matrix, vector, prior, rotation, position, scale, ties, prior_rotation, prior_position, row)
         if step == steps:
             break
@@ -402,27 +403,35 @@ def _add_points(
 
 @outlined
 def _add_contour(
-    beyond: Floats, lens: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats,
+    beyond: Floats, known: bool, lens: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats,
     settings: tuple[float, float, float, float, float, float, float, float], depth: Floats, index: Integers,
     matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
 ) -> float:  # fmt: skip
-    """Add the residuals of the drawing's contour from what may be covered, and return their cost."""
+    """Add the residuals of the drawing's contour from what may be covered, and return their cost.
+
+    Where the outline is known, parts of the contour that agree with it count, too.
+    """
     _, floor, edge, _, share, _, _, reach = settings
     height, width = index.shape
     cost = 0.0
     for i in range(1, height - 1):
         for j in range(1, width - 1):
-            if index[i, j] < 0 or beyond[i, j] == 0.0:
+            if index[i, j] < 0 or (beyond[i, j] == 0.0 and not known):
                 continue
             if index[i - 1, j] >= 0 and index[i + 1, j] >= 0 and index[i, j - 1] >= 0 and index[i, j + 1] >= 0:
                 continue
             gu, gv = (beyond[i, j + 1] - beyond[i, j - 1]) / 2.0, (beyond[i + 1, j] - beyond[i - 1, j]) / 2.0
             if not (math.isfinite(gu) and math.isfinite(gv)):
                 continue
+            if beyond[i, j] == 0.0:
+                steep = math.sqrt(gu * gu + gv * gv)
+                if steep == 0.0:
+                    continue
+                gu, gv = gu / steep, gv / steep
             z = depth[i, j]
             x, y = (j - lens[2]) / lens[0] * z, (i - lens[3]) / lens[1] * z
             pixel = z / lens[0]
-            r = (beyond[i, j] - 0.5) * pixel  # the border is between the centers of pixels
+            r = max(0.0, beyond[i, j] - 0.5) * pixel  # the border is between the centers of pixels
             weight, loss = _robust(r, reach)
             variance = edge * edge * pixel * pixel + floor * floor
             cost += share * loss * reach * reach / variance
