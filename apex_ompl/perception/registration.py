@@ -57,6 +57,7 @@ class Registration(NamedTuple):
         state: State with the joints that may differ corrected, shape (dof,).
         covariance: Of turn [rad] and shift [m] of measured points in the optical frame, and of the scale, shape (7, 7).
         pixels: Number of pixels that counted, of every ``correlation``-th column and row.
+        apart: Number of those whose surface is not where the robot's is expected, nor before it.
     """
 
     pose: Array
@@ -64,6 +65,7 @@ class Registration(NamedTuple):
     state: Array
     covariance: Array
     pixels: int
+    apart: int
 
 
 class CorrectedFrame(NamedTuple):
@@ -123,6 +125,8 @@ def register(given: CorrectedFrame, surface: RobotSurface, settings: Registratio
         matrix, vector, count = register_rows(measured, drawn, unknowns, noise, settings.floor, gate, cutoff)
         information = prior + settings.share * matrix
         unknowns = unknowns + np.linalg.solve(information, settings.share * vector - prior @ unknowns)
+    sparse = measured[::stride, ::stride]
+    apart = int(np.count_nonzero((index >= 0) & (sparse > depth + gate)))
     covariance = np.linalg.inv(information)
     corrected = state.copy()
     corrected[list(joints)] += unknowns[POSE:]
@@ -131,7 +135,7 @@ def register(given: CorrectedFrame, surface: RobotSurface, settings: Registratio
     found = pose.copy()
     found[:3, :3] = pose[:3, :3] @ pin.exp3(unknowns[:3])
     found[:3, 3] = pose[:3, 3] + pose[:3, :3] @ unknowns[3:6]
-    return Registration(found, 1.0 + float(unknowns[6]), corrected, covariance[:POSE, :POSE], count)
+    return Registration(found, 1.0 + float(unknowns[6]), corrected, covariance[:POSE, :POSE], count, apart)
 
 
 def corrected(
@@ -153,7 +157,7 @@ def corrected(
     depth = resampled(frame.depth, undistorted(camera)) * camera.depth.scale
     depth = np.where(depth >= camera.depth.nearest, depth, 0.0)
     spreads = [camera.angle_spread] * 3 + [camera.position_spread] * 3 + [camera.depth.scale_spread]
-    reported = Registration(camera.pose_at(surface.robot, state), 1.0, state, np.diag(spreads) ** 2, 0)
+    reported = Registration(camera.pose_at(surface.robot, state), 1.0, state, np.diag(spreads) ** 2, 0, 0)
     given = CorrectedFrame(camera, depth, reported, noise)
     if settings is None:
         return given

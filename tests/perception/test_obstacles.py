@@ -37,7 +37,7 @@ def found_in(
     everything = [*parts, floor]
     view = ZBuffer().draw(everything, CAMERA, EYE)
     depth = DepthSensor(gain=gain).measure(view, CAMERA, rng)[0]
-    known = Registration(EYE, 1.0, np.zeros(0), np.diag([1e-4] * 3 + [3e-4] * 3 + [1e-4]) ** 2, 0)
+    known = Registration(EYE, 1.0, np.zeros(0), np.diag([1e-4] * 3 + [3e-4] * 3 + [1e-4]) ** 2, 0, 0)
     seen = CorrectedFrame(CAMERA, depth, known, gain * CAMERA.depth.noise)
     return ObstacleFinder(settings).find(seen, colors(view, everything, LIGHT, rng))
 
