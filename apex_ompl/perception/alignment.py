@@ -1,8 +1,8 @@
 """From frames of a camera to a task: what section III-A of the paper calls vect_align(f).
 
 The objects in the hands are found (:mod:`apex_ompl.perception.held`), their contact faces are the vectors to be
-aligned, and obstacles of a color are found (:mod:`apex_ompl.perception.obstacles`). Where something is not known well enough for
-the task's tolerance there is no task, but a sentence that says why.
+aligned, and obstacles of a color are found (:mod:`apex_ompl.perception.obstacles`). Where something is not known well
+enough for the task's tolerance there is no task, but a sentence that says why.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_positive
 
 LENGTH = 0.05  # of vectors in the world [m]
-MOVED = 33.1  # squared error of six dimensions that a camera at its place exceeds once in 100 000
+MOVED = 22.5  # squared error of six dimensions that a camera at its place exceeds once in 1000
 FEWEST = 60  # pixels of the robot that tell whether the camera is at its place
 
 
@@ -48,7 +48,7 @@ class AlignSettings:
     most_obstacles: int = 20
     deviations: float = 1.0
     margin: float = 2.0
-    least_match: float = 0.5
+    least_match: float = 0.8
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -174,23 +174,23 @@ def _camera_reasons(given: CorrectedFrame, frame: Frame, robot: Robot, settings:
     if share >= settings.least_match and (turn / angle) ** 2 + (shift / place) ** 2 < MOVED:
         return []
     return [
-        f"{name!r} has moved since it was calibrated: {100 * share:.0f} % of the robot's surface is where it is expected, "
-        f"after a correction of {1e3 * shift:.0f} mm and {np.degrees(turn):.1f} degrees"
+        f"{name!r} has moved since it was calibrated: {100 * share:.0f} % of the robot's surface is where it is "
+        f"expected, after a correction of {1e3 * shift:.0f} mm and {np.degrees(turn):.1f} degrees"
     ]
 
 
 def _tolerance_reasons(chosen: Sequence[HeldObject], alignment: Alignment, settings: AlignSettings) -> list[str]:
     """Return which objects are not known well enough for the tolerance."""
     tolerance = alignment.tolerance or ALIGNMENT_DEFAULTS[alignment.kind][1]
-    share = settings.deviations * np.sqrt(len(chosen))
+    share, length = settings.deviations * np.sqrt(len(chosen)), min(tolerance.lateral, tolerance.axial)
     reasons = []
     for one in chosen:
         place = float(np.sqrt(np.linalg.eigvalsh(one.face_covariance)[-1]))
         place, turn = share * place, share * one.axis_spread / np.sqrt(2.0)
-        if place > min(tolerance.lateral, tolerance.axial) or (one.body.sphere is None and turn > tolerance.angle):
+        if place > length or (one.body.sphere is None and turn > tolerance.angle):
             reasons.append(
                 f"{one.name!r} is known to {1e3 * place:.1f} mm and {np.degrees(turn):.1f} degrees only, the tolerance "
-                f"is {1e3 * min(tolerance.lateral, tolerance.axial):.1f} mm and {np.degrees(tolerance.angle):.1f} degrees"
+                f"is {1e3 * length:.1f} mm and {np.degrees(tolerance.angle):.1f} degrees"
             )
     return reasons
 

@@ -46,6 +46,7 @@ CALIBRATION_SEEDS = (1001, 1002)
 FRAMES = 9
 SEEN = 0.85
 GATE = (0.0045, 2.2)  # largest own standard deviations of face [m] and axis [degrees]
+RENDERERS = 2  # that draw the same scenes, so that bands are those of half of the objects
 DIMENSIONS = 6
 CHI_SQUARED, MEDIAN = 12.592, 5.348  # 95 % and 50 % of six degrees of freedom
 METHODS = ("grasp alone", "one frame", "nine frames")
@@ -124,7 +125,7 @@ def samples(made: Robot, renderer: Renderer, seed: int, n: int) -> list[Sample]:
     return found
 
 
-def band(count: int) -> tuple[float, float]:
+def band(count: float) -> tuple[float, float]:
     """Return the 95 % band of the mean normalized squared error over its dimensions, of ``count`` objects."""
     half = 1.96 * np.sqrt(2.0 / (DIMENSIONS * max(count, 1)))
     return 1.0 - half, 1.0 + half
@@ -180,8 +181,9 @@ def covariance_rows(found: Sequence[Sample]) -> list[list[Any]]:
     for method in METHODS:
         for kind in sorted({one.kind for one in found}):
             squared = np.array([s.squared for s in found if s.method == method and s.kind == kind and not s.reason])
-            low, high = band(len(squared))
-            share, slack = float(np.mean(squared < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / len(squared))
+            count = len(squared) / RENDERERS
+            low, high = band(count)
+            share, slack = float(np.mean(squared < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / count)
             rows.append(
                 [method, kind, len(squared), f"{squared.mean() / DIMENSIONS:.2f}", f"{low:.2f} to {high:.2f}",
                  f"{np.median(squared) / MEDIAN:.2f}", f"{share:.3f}",
@@ -212,6 +214,29 @@ def calibrate(made: Robot, n: int) -> None:
     print(table(SQUARED, covariance_rows(found)))
 
 
+def compact(found: Sequence[Sample]) -> dict[str, list[Any]]:
+    """Return samples for the results by their fields, numbers with four digits."""
+    rows = [asdict(one) for one in found]
+    return {
+        name: [float(f"{r[name]:.4g}") if isinstance(r[name], float) else r[name] for r in rows] for name in rows[0]
+    }
+
+
+def tables(drawn: dict[str, dict[int, list[Sample]]], n: int) -> tuple[dict[str, Any], str]:
+    """Return the results, and their tables, of the samples of each renderer and seed."""
+    rows = [row for name, by_seed in drawn.items() for row in errors_rows(name, by_seed, n * len(by_seed))]
+    found = [one for by_seed in drawn.values() for mine in by_seed.values() for one in mine]
+    missed: dict[str, int] = {}
+    for one in found:
+        if one.reason and one.method == METHODS[-1]:
+            words = re.sub(r"'[^']*':?|[0-9.]+ ?%?", "", one.reason).strip()
+            missed[words] = missed.get(words, 0) + 1
+    reasons = [[reason, count] for reason, count in sorted(missed.items(), key=lambda item: -item[1])]
+    covariance = covariance_rows(found)
+    parts = [table(HEAD, rows), table(SQUARED, covariance), table(("no answer, nine frames", "N"), reasons)]
+    return {"rows": rows, "covariance": covariance, "samples": compact(found)}, "\n\n".join(parts)
+
+
 def main() -> None:
     """Measure, and write the results."""
     parser = record.parser(__doc__ or "", 150, "scenes of a seed and a renderer")
@@ -220,24 +245,12 @@ def main() -> None:
     if given.calibrate:
         calibrate(made, given.n)
         return
-    rows, all_samples = [], []
-    for renderer in (ZBuffer(), Mujoco()):
-        drawn = {seed: samples(made, renderer, seed, given.n) for seed in SEEDS}
-        rows += errors_rows(type(renderer).__name__, drawn, given.n * len(SEEDS))
-        all_samples += [one for found in drawn.values() for one in found]
-    missed: dict[str, int] = {}
-    for one in all_samples:
-        if one.reason and one.method == METHODS[-1]:
-            words = re.sub(r"'[^']*':?|[0-9.]+ ?%?", "", one.reason).strip()
-            missed[words] = missed.get(words, 0) + 1
-    reasons = [[reason, count] for reason, count in sorted(missed.items(), key=lambda item: -item[1])]
-    parts = [
-        table(HEAD, rows),
-        table(SQUARED, covariance_rows(all_samples)),
-        table(("no answer, nine frames", "N"), reasons),
-    ]
-    data = {"rows": rows, "covariance": covariance_rows(all_samples), "samples": [asdict(one) for one in all_samples]}
-    record.write("perception_held", data, "\n\n".join(parts), n=given.n, seeds=list(SEEDS))
+    drawn = {
+        type(renderer).__name__: {seed: samples(made, renderer, seed, given.n) for seed in SEEDS}
+        for renderer in (ZBuffer(), Mujoco())
+    }
+    data, text = tables(drawn, given.n)
+    record.write("perception_held", data, text, n=given.n, seeds=list(SEEDS))
 
 
 if __name__ == "__main__":
