@@ -125,7 +125,7 @@ def test_two_of_a_name_and_unknown_names_are_refused(scene: SyntheticScene, robo
     with pytest.raises(ParameterError, match="one of"):
         vect_align(scene.frames[0], robot, [first], alignment)
     vector = WorldVector(link=first.link, tail=(0.0, 0.0, 0.0), tip=(0.0, 0.0, 1.0))
-    with pytest.raises(ParameterError, match="that the camera is to find"):
+    with pytest.raises(ParameterError, match="the camera is to find"):
         vect_align(scene.frames[0], robot, [first], Alignment(kind="vertical", first=first.name, second=vector))
     with pytest.raises(ParameterError):
         AlignSettings(deviations=0.0)
