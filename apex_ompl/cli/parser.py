@@ -203,7 +203,9 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser("run", help="go to a goal in closed loop while obstacles move")
+    parser = commands.add_parser(
+        "run", help="go to a goal in closed loop while obstacles move, or execute a task in physics"
+    )
     parser.add_argument("world", help=f"a world such as popup/vertical/large/12, or {PROBLEM_HELP}")
     parser.add_argument(
         "--method", default="apex", help="apex, or a replanner of docs/closed_loop.md such as no-network, "
@@ -224,7 +226,16 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
     )  # fmt: skip
     parser.add_argument("--latency", type=float, metavar="SECONDS", help="of a replan (default: what its work costs)")
     parser.add_argument("--timeout", type=float, default=30.0, metavar="SECONDS", help="default: %(default)s")
-    parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    parser.add_argument(
+        "--seed", type=int, help="of the loop (default: 0); in physics of the start, which without it is that of the "
+        "problem",
+    )  # fmt: skip
+    parser.add_argument(
+        "--driver", metavar="NAME", help="the robot that is driven: mujoco, in physics, or kinematic, an exact one. "
+        "With mujoco a problem whose obstacles stand still is executed to the end of its task, to which of these options "
+        "--seed, --timeout, --out, --film and --json apply",
+    )  # fmt: skip
+    parser.add_argument("--film", type=Path, metavar="FILE", help="write a film of a task in physics: .mp4")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the run: .npz or .json")
     parser.add_argument("--json", action="store_true", help="print the outcome and the metrics as JSON")
     parser.set_defaults(run="run:run")
@@ -289,7 +300,7 @@ def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--board-link", metavar="LINK", help="that carries the board (default: it stands still)")
     parser.add_argument("--camera-link", metavar="LINK", help="that carries the camera (default: it stands still)")
     parser.add_argument("--camera", type=Path, metavar="FILE", help="camera file (default: the frames' own)")
-    parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints that may read a constant too much")
+    parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints whose readings may be off")
     parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
     parser.set_defaults(run="perception:calibrate")
 

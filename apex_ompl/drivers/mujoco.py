@@ -24,7 +24,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import fields_line
-from apex_ompl.util.validation import check_array, check_integer, finite_array
+from apex_ompl.util.validation import check_array, check_integer, check_name, check_number, finite_array
 
 BLOCK = 500  # steps whose commands are computed at once
 MOST_STEPS = 10**7  # of one advance
@@ -108,6 +108,7 @@ class MujocoDriver:
         loads = twin.loads if assumed is None else held_loads(robot, assumed, twin.settings)
         self._loaded, self._bare = Dynamics(robot, loads), Dynamics(robot)
         self._rotors, self._friction = twin.rotor_inertia, twin.friction
+        self._pressed, self._press = np.zeros(len(self.names)), np.zeros(len(self.names))
         self._steps, self._closed = 0, False
         self._renderer: Any = None
         self.forget()
@@ -128,6 +129,10 @@ class MujocoDriver:
         data, twin = self.data, self.twin
         return DriverState(self.time, data.qpos[twin.q].copy(), data.qvel[twin.v].copy())
 
+    def commanded(self) -> Array:
+        """Return the commanded positions, without what hands press beyond them, shape (dof,) [rad]."""
+        return np.asarray(self._commands.states(np.array([self.time]))[0, 0])
+
     def send(self, motion: Trajectory, at: float) -> None:
         """Follow a motion from a time on (:meth:`apex_ompl.drivers.driver.Driver.send`)."""
         self._check_open()
@@ -137,6 +142,20 @@ class MujocoDriver:
         """Come to rest within the limits, along the motion that is under way; motions that wait are dropped."""
         self._check_open()
         self._commands.stop(self.time)
+
+    def press(self, joint: str, by: float) -> None:
+        """Close a hand further than motions command, at its largest speed.
+
+        Args:
+            joint: Its synergy.
+            by: How far, added to the commanded position; 0 for not at all.
+
+        Raises:
+            UnknownNameError: There is no such joint.
+        """
+        check_name(joint, "joint", self.names)
+        check_number(by, "by", 0.0, 1.0)
+        self._press[self.names.index(joint)] = by
 
     @property
     def fault(self) -> str:
@@ -252,7 +271,10 @@ class MujocoDriver:
         own = self._rotors * a + self._friction * v
         torques = self._loaded.torques(q, v, a) - self._bare.torques(q) + own
         before = self._commands.states(times - twin.settings.step / 2.0)[1]
-        feedforward = torques + twin.kp * q + twin.kd * before
+        reach = self.limits.velocity * twin.settings.step * np.arange(1, count + 1)[:, None]
+        pressed = self._pressed + np.clip(self._press - self._pressed, -reach, reach)
+        self._pressed = pressed[-1]
+        feedforward = torques + twin.kp * np.minimum(q + pressed, self.limits.upper) + twin.kd * before
         rows = np.stack([q, np.empty_like(q), own, np.empty_like(q)], axis=2)
         for k, row in enumerate(rows):
             row[:, 1] = data.qpos[twin.q]

@@ -39,6 +39,7 @@ PANDA_STIFFNESS = (4500.0, 4500.0, 3500.0, 3500.0, 2000.0, 2000.0, 2000.0)  # of
 BANDWIDTH = 60.0  # natural frequency of the servos of other joints [rad/s]
 FOLLOWER_ARMATURE, FOLLOWER_DAMPING = 1e-4, 5e-3  # of joints that mimic others
 LEADER_ARMATURE, LEADER_DAMPING = 0.02, 0.05  # of joints that others mimic, such as the synergy of a hand
+FINGER_DAMPING = 0.01  # of the springs by which fingers yield [Nm s/rad]
 LEAST_MASS, LEAST_INERTIA = 1e-3, 1e-6  # of links that move and have none in the URDF [kg, kg m^2]
 SOFT_CONTACT = {"solref": [0.004, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
 RIGID = {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 0.001, 0.5, 2.0]}  # of mimic joints and welds
@@ -65,6 +66,10 @@ class TwinSettings:
         friction: Coefficient of friction of all surfaces.
         density: Density of held objects without a mass [kg/m^3].
         floor: Height of the floor, which only objects that fall can touch [m].
+        finger_stiffness: Stiffness of springs by which joints that mimic others follow them, so that fingers yield to
+            what they grasp, and held objects collide with the hands that hold them [Nm/rad]. Without it such joints
+            follow exactly, and held objects only collide with other links.
+        grip: Largest torque of the joints that others mimic, where fingers yield [Nm].
     """
 
     step: float = 0.001
@@ -74,6 +79,8 @@ class TwinSettings:
     friction: float = 0.8
     density: float = 300.0
     floor: float = -0.75
+    finger_stiffness: float | None = None
+    grip: float = 6.0
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -81,8 +88,10 @@ class TwinSettings:
         Raises:
             ParameterError: A number is out of its range.
         """
-        for name in ("step", "armature", "density"):
+        for name in ("step", "armature", "density", "grip"):
             check_positive(getattr(self, name), name)
+        if self.finger_stiffness is not None:
+            check_positive(self.finger_stiffness, "finger_stiffness")
         for name in ("damping", "friction"):
             check_number(getattr(self, name), name, 0.0)
         finite_numbers({"floor": self.floor}, "settings")
@@ -171,6 +180,48 @@ class Twin:
         limited = model.jnt_actfrclimited[[joint.id for joint in joints]].astype(bool)
         self.motor_torque = np.where(limited, model.jnt_actfrcrange[[joint.id for joint in joints], 1], np.inf)
         self._compensated = model.jnt_actgravcomp[[joint.id for joint in joints]].astype(float)
+
+    @property
+    def yields(self) -> bool:
+        """Whether fingers yield, and held objects collide with the hands that hold them."""
+        return self.settings.finger_stiffness is not None
+
+    def welded_to(self, held: AttachedObject) -> tuple[str, ...]:
+        """Return the links that an object can be welded to: its holder, and where fingers yield any palm.
+
+        An object that no link may touch stands on another one there, and is not welded.
+        """
+        if not self.yields:
+            return (held.link,)
+        palms = [hand.palm for hand in self.robot.hands.values()]
+        return () if held.touch_links == () else tuple(dict.fromkeys((held.link, *palms)))
+
+    def weld(self, data: Any, name: str, link: str, active: bool = True) -> None:
+        """Weld a held object to a link where it is now, or cut that weld.
+
+        Raises:
+            UnknownNameError: There is no such object, or no weld between them.
+        """
+        check_name(f"{name} {link}", "weld", [self.model.equality(k).name for k in range(self.model.neq)])
+        equality, palm, body = self.model.equality(f"{name} {link}"), data.body(link), data.body(name)
+        inverse, turn, offset, place = np.empty(4), np.empty(4), np.empty(3), np.empty(3)
+        self._mj.mju_negPose(place, inverse, palm.xpos, palm.xquat)
+        self._mj.mju_mulPose(offset, turn, place, inverse, body.xpos, body.xquat)
+        equality.data[3:10] = [*offset, *turn]
+        data.eq_active[equality.id] = active
+
+    def forces(self, data: Any, name: str) -> dict[str, Array]:
+        """Return the forces of other bodies on a body by their names, in the world, each of shape (3,) [N]."""
+        found: dict[str, Array] = {}
+        owner, force = self.model.body(name).id, np.empty(6)
+        for k, contact in enumerate(data.contact):
+            first, second = (int(self.model.geom_bodyid[geom]) for geom in contact.geom)
+            if owner not in (first, second):
+                continue
+            self._mj.mj_contactForce(self.model, data, k, force)
+            other, sign = (self.names[first], 1.0) if second == owner else (self.names[second], -1.0)
+            found[other] = found.get(other, np.zeros(3)) + sign * contact.frame.reshape(3, 3).T @ force[:3]
+        return found
 
     @property
     def rotor_inertia(self) -> Array:
@@ -280,7 +331,7 @@ class Twin:
         except ValueError as error:
             reason = " ".join(str(error).split())
             raise RobotError(f"MuJoCo cannot make a model of {self.robot.name} ({reason})") from error
-        joints = int(np.sum(model.eq_type == self._mj.mjtEq.mjEQ_JOINT))
+        joints = int(np.sum(model.eq_type == self._mj.mjtEq.mjEQ_JOINT)) + model.ntendon
         if joints != len(self.mimics):
             raise RobotError(f"MuJoCo has {joints} equalities for the {len(self.mimics)} mimic joints of the URDF")
         return model
@@ -336,21 +387,34 @@ class Twin:
             elif name in followers:
                 joint.armature, damping = FOLLOWER_ARMATURE, FOLLOWER_DAMPING
             joint.damping = [damping, 0.0, 0.0] if np.ndim(joint.damping) else damping
-            joint.actfrclimited = int(math.isfinite(effort.get(name, math.inf)))
+            yields = name in leaders and settings.finger_stiffness is not None
+            joint.actfrclimited = int(yields or math.isfinite(effort.get(name, math.inf)))
             joint.limited = int(name in effort)
             if name not in effort:
                 continue
             k = robot.joint_names.index(name)
             own = joint.armature * robot.limits.acceleration[k] + damping * robot.limits.velocity[k]
-            most = effort[name] + own if joint.actfrclimited else 0.0
+            most = settings.grip if yields else effort[name] + own if joint.actfrclimited else 0.0
             joint.actfrcrange = [-most, most]
             joint.actgravcomp = name not in leaders
             spec.add_actuator(name=name, trntype=mj.mjtTrn.mjTRN_JOINT, target=name)  # a motor of gear 1
         for one in self.mimics:
+            if settings.finger_stiffness is not None:
+                self._add_spring(spec, one, settings.finger_stiffness)
+                continue
             line = [one.offset, one.multiplier, 0.0, 0.0, 0.0]
             added = spec.add_equality(name=one.joint, type=mj.mjtEq.mjEQ_JOINT, objtype=mj.mjtObj.mjOBJ_JOINT)
             added.name1, added.name2, added.data[:5] = one.joint, one.leader, line
             added.solref, added.solimp = RIGID["solref"], RIGID["solimp"]
+
+    def _add_spring(self, spec: Any, mimic: Mimic, stiffness: float) -> None:
+        """Let a joint follow another one by a spring on its distance from where it mimics it."""
+        tendon = spec.add_tendon(name=mimic.joint)
+        for name, value in (("stiffness", stiffness), ("damping", FINGER_DAMPING)):
+            setattr(tendon, name, [value, 0.0, 0.0] if np.ndim(getattr(tendon, name)) else value)
+        tendon.springlength = [mimic.offset, mimic.offset]
+        tendon.wrap_joint(mimic.joint, 1.0)
+        tendon.wrap_joint(mimic.leader, -mimic.multiplier)
 
     def _add_static(self, spec: Any, body: Body, role: str) -> None:
         """Add a fixture or an obstacle; one that moves or appears is a mocap body."""
@@ -369,10 +433,11 @@ class Twin:
         added.mass, added.ipos, added.explicitinertial = load.mass, load.center, True
         added.fullinertia = load.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         self._add_geoms(spec, added, coal_geometry(held), np.eye(4), "held")
-        weld = spec.add_equality(name=held.name, type=mj.mjtEq.mjEQ_WELD, objtype=mj.mjtObj.mjOBJ_BODY)
-        weld.name1, weld.name2, weld.active = held.link, held.name, True
-        weld.data[:11] = [0.0, 0.0, 0.0, *held.position, *_quaternion(held.pose), 1.0]
-        weld.solref, weld.solimp = RIGID["solref"], RIGID["solimp"]
+        for link in self.welded_to(held):
+            weld = spec.add_equality(name=f"{held.name} {link}", type=mj.mjtEq.mjEQ_WELD, objtype=mj.mjtObj.mjOBJ_BODY)
+            weld.name1, weld.name2, weld.active = link, held.name, link == held.link
+            weld.data[:11] = [0.0, 0.0, 0.0, *held.position, *_quaternion(held.pose), 1.0]
+            weld.solref, weld.solimp = RIGID["solref"], RIGID["solimp"]
 
     def _add_payload(self, spec: Any, load: Load) -> None:
         """Add the mass of a payload, which has no shape."""
@@ -402,13 +467,13 @@ class Twin:
         links = [link_of(model, item) for item in items]
         checked = {frozenset((links[pair.first], links[pair.second])) for pair in robot.geometry.collisionPairs}
         pairs = {frozenset(pair) for pair in combinations(sorted(set(links)), 2)} - checked
-        for held in self.held:
+        for held in self.held if not self.yields else ():
             own = [link for link in held.touch_links or () if link in links]
             for holder in held.holders if held.touch_links is None else ():
                 own += robot.hand_of(holder)
             pairs |= {frozenset((held.name, link)) for link in own}
         for one, other in combinations(self.held, 2):
-            if _joint_of(robot, one.link) == _joint_of(robot, other.link):
+            if not self.yields and _joint_of(robot, one.link) == _joint_of(robot, other.link):
                 pairs.add(frozenset((one.name, other.name)))
         pairs |= {frozenset(pair) for pair in (self.problem.allowed if self.problem else ()) if len(set(pair)) == 2}
         for first, second in sorted(sorted(pair) for pair in pairs):

@@ -1,4 +1,4 @@
-"""Perception: from frames of a camera to objects in the hands, obstacles, and a task."""
+"""Perception: cameras, their calibration, and frames with color and depth."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ if TYPE_CHECKING:
     from apex_ompl.perception.alignment import AlignSettings as AlignSettings
     from apex_ompl.perception.alignment import SeenTask as SeenTask
     from apex_ompl.perception.alignment import vect_align as vect_align
+    from apex_ompl.perception.bags import bag_frames as bag_frames
     from apex_ompl.perception.boards import Board as Board
     from apex_ompl.perception.camera import Camera as Camera
     from apex_ompl.perception.camera import DepthErrors as DepthErrors
     from apex_ompl.perception.camera import look_at as look_at
+    from apex_ompl.perception.depth_scale import measured_depths as measured_depths
     from apex_ompl.perception.frames import Frame as Frame
     from apex_ompl.perception.frames import load_frames as load_frames
     from apex_ompl.perception.frames import save_sequence as save_sequence
@@ -26,16 +28,27 @@ if TYPE_CHECKING:
     from apex_ompl.perception.obstacles import ObstacleFinder as ObstacleFinder
     from apex_ompl.perception.obstacles import ObstacleSettings as ObstacleSettings
     from apex_ompl.perception.obstacles import SeenObstacle as SeenObstacle
+    from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
+    from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
+    from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
+    from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
+    from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "alignment": "AlignSettings SeenTask vect_align",
+        "bags": "bag_frames",
         "boards": "Board",
         "camera": "Camera DepthErrors look_at",
+        "depth_scale": "measured_depths",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
         "held": "HeldObject HeldObjectFinder HeldSettings",
         "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",
+        "occupancy": "OccupancyMap OccupancySettings",
+        "ros2_camera": "Ros2Camera",
+        "synchronizer": "Synchronizer",
+        "twin_camera": "TwinCamera",
     },  # fmt: skip
 )

@@ -69,7 +69,8 @@ class Board(StrictModel):
         Raises:
             ApexError: Another image, an unknown dictionary, or OpenCV is not installed.
         """
-        if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3:
+        color = np.asarray(color)
+        if color.dtype != np.uint8 or color.ndim != 3 or color.shape[2] != 3 or not color.size:
             given = f"{color.dtype} of shape {color.shape}"
             raise ParameterError("color", given, "uint8 of shape (height, width, 3)")
         cv2 = opencv()

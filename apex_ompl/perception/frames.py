@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -55,6 +55,9 @@ class Frame:
             ApexError: An image has another size than the camera's, depths are negative or of another unit, or a number
                 is not finite.
         """
+        check_camera(self.camera)
+        if not isinstance(self.joints, Mapping):
+            raise ParameterError("joints", self.joints, "positions by the names of joints")
         shape = (self.camera.height, self.camera.width)
         depth = depth_in_meters(self.depth)
         check_array(depth, shape, "depth")
@@ -126,7 +129,17 @@ class Frame:
             raise FileFormatError(str(file), error.name, error.value, f"expected {error.expected}") from error
 
 
-def save_sequence(frames: Iterator[Frame] | list[Frame], folder: str | Path) -> int:
+def check_camera(given: object, name: str = "camera") -> None:
+    """Check that an object is a camera.
+
+    Raises:
+        ParameterError: It is none.
+    """
+    if not isinstance(given, Camera):
+        raise ParameterError(name, given, "a Camera")
+
+
+def save_sequence(frames: Iterable[Frame], folder: str | Path) -> int:
     """Write frames as files of a folder, in order, and return how many.
 
     Raises:
@@ -134,6 +147,8 @@ def save_sequence(frames: Iterator[Frame] | list[Frame], folder: str | Path) -> 
     """
     at, count, last = make_folder(folder, "folder of frames"), 0, -math.inf
     for frame in frames:
+        if not isinstance(frame, Frame):
+            raise ParameterError("frames", frame, "frames")
         if frame.stamp <= last:
             raise ParameterError("stamp", frame.stamp, f"a time after that of the frame before, {last:g} s")
         frame.save(at / f"{count:06d}{SUFFIX}")

@@ -8,7 +8,8 @@ the distances in the images between the corners that were found and those that a
 weights.
 
 An offset of the first joint of an arm is a turn of the camera about its axis, and one of the last joint a turn of the
-board: they are not told apart, and are left out.
+board: images do not tell which, so offsets are sought of the joints in between. Where images tell nothing of an offset,
+its standard deviation stays the one assumed beforehand.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from apex_ompl.perception.library import least_squares, opencv
 from apex_ompl.robot.model import Robot
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
-from apex_ompl.util.validation import check_array, check_states, finite_array, number_array
+from apex_ompl.util.validation import check_array, check_seed, check_states, finite_array, number_array
 
 FEWEST_VIEWS, FEWEST_CORNERS = 4, 4
 LEAST_TURN = np.deg2rad(5.0)  # about a second axis, below which the position is not known
@@ -104,6 +105,7 @@ def calibrate(
         UnknownNameError: There is no such link or joint.
         MissingFileError: The extra ``perception`` is not installed.
     """
+    check_seed(seed)
     if camera.link is None and board_link is None:
         raise ParameterError("board_link", board_link, "the link that carries the board, or a camera on a link")
     if camera.link == board_link:
@@ -111,6 +113,8 @@ def calibrate(
     for name in offsets:
         if name not in robot.joint_names:
             raise UnknownNameError("joint", name, robot.joint_names)
+    if not isinstance(views, Sequence):
+        raise ParameterError("views", views, "a list of views")
     kept = _checked(robot, board, views)
     fit = _Fit(robot, camera, board, kept, board_link=board_link, offsets=tuple(dict.fromkeys(offsets)))
     return fit.solved(np.random.default_rng(seed))
@@ -119,7 +123,10 @@ def calibrate(
 def _checked(robot: Robot, board: Board, views: Sequence[View]) -> list[View]:
     """Return the views that show the board, as arrays."""
     count, kept = len(board.corners), []
-    for k, (state, pixels) in enumerate(views):
+    for k, view in enumerate(views):
+        if not isinstance(view, View):
+            raise ParameterError(f"view {k}", view, "a View: a state, and pixels of corners")
+        state, pixels = view
         q, found = finite_array(state, f"state of view {k}"), number_array(pixels, f"corners of view {k}")
         check_states(q[None], len(robot.joint_names), f"state of view {k}")
         check_array(found, (count, 2), f"corners of view {k}")

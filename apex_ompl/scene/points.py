@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.scene.bodies import PointFile
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN
-from apex_ompl.util.validation import check_array, check_integer, finite_array, number_array, rigid_pose
+from apex_ompl.util.validation import check_array, check_integer, check_positive, finite_array, number_array, rigid_pose
 
 LARGEST = 1e4  # larger coordinates are errors [m]
 MILLIMETER = 1e-3  # unit of depth images of whole numbers [m]
 FEW, MANY = 50, 50.0  # depths of whole numbers are larger [mm], medians of others are not [m]
+SAMPLED = 10_000  # pixels by which the unit of an image is checked
 PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -294,15 +297,42 @@ def depth_in_meters(depth: ArrayLike) -> Array:
     image = number_array(depth, "depth")
     if image.ndim != 2:
         raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
-    with np.errstate(invalid="ignore"):
-        seen = image[np.isfinite(image) & (image > 0.0)]
     if np.asarray(depth).dtype.kind in "iu":
-        if len(seen) and seen.max() <= FEW:
-            raise ParameterError("depth", f"whole numbers up to {seen.max():g}", "millimeters, or floats in meters")
+        largest = image.max(initial=0.0)
+        if 0.0 < largest <= FEW:
+            raise ParameterError("depth", f"whole numbers up to {largest:g}", "millimeters, or floats in meters")
         return image * MILLIMETER
+    pixels = image.ravel()
+    seen = _depths(pixels[:: 1 + pixels.size // SAMPLED])
+    if not len(seen):
+        seen = _depths(pixels)
     if len(seen) and np.median(seen) > MANY:
         raise ParameterError("depth", f"floats around {np.median(seen):g}", "meters, or whole numbers in millimeters")
     return image
+
+
+def _depths(pixels: Array) -> Array:
+    """Return the numbers that are depths."""
+    with np.errstate(invalid="ignore"):
+        return pixels[np.isfinite(pixels) & (pixels > 0.0)]
+
+
+def points_of(points: ArrayLike, radius: float) -> PointFile:
+    """Return balls in memory as the ``points`` of an obstacle, which no file is needed for.
+
+    Args:
+        points: Their centers, shape (N, 3) [m].
+        radius: Their radius [m].
+
+    Raises:
+        ParameterError: The points have another shape or are not finite, there are none, or the radius is not positive.
+    """
+    cloud = finite_array(points, "points")
+    check_array(cloud, ("N", 3), "points", least=1)
+    check_positive(radius, "radius", "a positive number of meters")
+    content = io.BytesIO()
+    np.save(content, cloud.astype(np.float32))
+    return PointFile(file="memory.npy", radius=radius, content=base64.b64encode(content.getvalue()).decode())
 
 
 def points_from_depth(

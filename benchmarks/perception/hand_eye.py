@@ -26,7 +26,10 @@ from apex_ompl.robot import Robot
 from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
 
-DEPENDS = ("apex_ompl/perception",)
+DEPENDS = (
+    "apex_ompl/perception/boards.py", "apex_ompl/perception/camera.py", "apex_ompl/perception/hand_eye.py",
+    "apex_ompl/robot/model.py",
+)  # fmt: skip
 CAMERA = Camera(
     width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5), distortion=(0.05, -0.1, 1e-3, -5e-4, 0.0)
 )

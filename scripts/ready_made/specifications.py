@@ -178,7 +178,7 @@ SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecifi
     ),
     AlignmentSpecification(
         "problems/data/pour.yaml", wall_between(), two_cups,
-        Alignment(kind="pour", first="full", second="empty"),
+        Alignment(kind="pour", first="full", second="empty", tilt=(1.0, 1.3)),
     ),
     AlignmentSpecification(
         "problems/data/handover.yaml", wall_between(), bar,

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 import apex_ompl
@@ -60,6 +59,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         "--latency 0.05 --timeout 4 --evade risk --seed 1 --out run.npz --json",
     ),
     ((0, 1), "run own.yaml --clock real --timeout 3 --out real.json"),
+    ((0, 1), "run own.yaml --driver kinematic --timeout 3"),
     ((2,), "ros2 own.yaml --ros-args -p speed:=7.0"),  # without ROS as well as with a faulty parameter
     ((0,), "render plan.npz --out plan.png --azimuth 10"),
     ((0,), "plot plan.npz --out plan.svg"),
@@ -151,6 +151,8 @@ def _write_frames(robot: apex_ompl.Robot) -> None:
 
 def _board_image(camera: Camera, pose: Any) -> Any:
     """Return the image of a board of 6 times 5 squares of 6 cm, or None where a part of it is outside."""
+    import cv2  # here, since the words of the calls are read without it
+
     markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
     board = cv2.aruco.CharucoBoard((6, 5), 0.06, 0.045, markers).generateImage((240, 200))
     ends = np.array([[0, 0], [240, 0], [240, 200], [0, 200]], np.float32)

@@ -53,6 +53,26 @@ def test_rays_undo_the_projection() -> None:
     np.testing.assert_allclose(CAMERA.rays(CAMERA.project(points)), points[:, :2] / points[:, 2:], atol=1e-9)
 
 
+def test_strong_distortion_is_undone_or_refused() -> None:
+    barrel = Camera(
+        width=64, height=48, focal=(60.0, 60.0), center=(31.5, 23.5), distortion=(-0.15, 0.0, 0.0, 0.0, 0.0)
+    )
+    pixels = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1)
+    points = np.concatenate([barrel.grid, np.ones((48, 64, 1))], axis=-1)
+    np.testing.assert_allclose(barrel.project(points), pixels, atol=1e-9)
+    turned_back = np.sqrt(1.0 / 0.45)  # where the derivative of r (1 - 0.15 r^2) is zero
+    seen = barrel.project([[0.99 * turned_back, 0.0, 1.0], [1.01 * turned_back, 0.0, 1.0]])
+    assert np.isfinite(seen[0]).all() and np.isnan(seen[1]).all()
+    with pytest.raises(ApexError, match="undone in the whole image"):
+        Camera(width=64, height=48, focal=(30.0, 30.0), center=(31.5, 23.5), distortion=(-0.15, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_a_copy_of_a_camera_has_rays_of_its_own() -> None:
+    assert CAMERA.grid.shape == (48, 64, 2)
+    other = CAMERA.model_copy(update={"focal": (10.0, 10.0), "distortion": (0.0,) * 5})
+    np.testing.assert_allclose(other.grid[0, 0], [-3.15, -2.3])
+
+
 def test_a_depth_image_of_a_plane_gives_points_of_it() -> None:
     normal, offset = np.array([0.1, -0.2, 1.0]), 1.3
     depth = offset / (CAMERA.grid @ normal[:2] + normal[2])
@@ -63,6 +83,7 @@ def test_a_depth_image_of_a_plane_gives_points_of_it() -> None:
     np.testing.assert_allclose(points[~unknown] @ normal, offset, atol=1e-12)
     scaled = CAMERA.model_copy(update={"depth": CAMERA.depth.model_copy(update={"scale": 1.1})})
     np.testing.assert_allclose(scaled.points(depth)[~unknown], 1.1 * points[~unknown])
+    np.testing.assert_allclose(CAMERA.points(np.full((48, 64), 1200, np.uint16)), CAMERA.points(np.full((48, 64), 1.2)))
 
 
 def test_a_camera_looks_at_a_point(robot: Robot) -> None:
@@ -121,10 +142,16 @@ def test_faulty_camera_files_are_refused(tmp_path: Path, text: str, named: str) 
     [
         lambda robot: CAMERA.placed(2.0 * np.eye(4)),
         lambda robot: CAMERA.points(np.ones((3, 3))),
+        lambda robot: CAMERA.points(np.full((48, 64), 1200.0)),
+        lambda robot: CAMERA.project([1.0, 2.0]),
+        lambda robot: CAMERA.projection_jacobian([1.0, 2.0]),
+        lambda robot: CAMERA.rays([1.0, 2.0, 3.0]),
+        lambda robot: CAMERA.rays("pixels"),
         lambda robot: CAMERA.pose_at(robot, np.zeros(3)),
         lambda robot: CAMERA.model_copy(update={"link": "no_link"}).pose_at(robot, robot.home),
         lambda robot: look_at((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
         lambda robot: look_at((0.0, 0.0), (0.0, 0.0, 0.0)),
+        lambda robot: look_at((1.0, 0.0, 0.0), (0.0, 0.0, 0.0), np.nan),
         lambda robot: Camera.load("/none/camera.yaml"),
         lambda robot: CAMERA.save("/none/camera.yaml"),
     ],
@@ -159,6 +186,8 @@ def test_a_sequence_is_a_folder(tmp_path: Path) -> None:
     assert len(load_frames(tmp_path / "frames" / "000003.npz")) == 1
     with pytest.raises(ParameterError, match="after that of the frame before"):
         save_sequence([frame(1.0), frame(1.0)], tmp_path / "others")
+    with pytest.raises(ParameterError, match="frames"):
+        save_sequence([1], tmp_path / "others")  # type: ignore[list-item]
     (tmp_path / "none").mkdir()
     with pytest.raises(MissingFileError, match=r"\.npz"):
         load_frames(tmp_path / "none")
@@ -176,6 +205,8 @@ def test_a_sequence_is_a_folder(tmp_path: Path) -> None:
         ({"color": np.zeros((48, 64, 3))}, "color"),
         ({"stamp": np.nan}, "stamp"),
         ({"joints": {"a": np.inf}}, "joints"),
+        ({"joints": [1.0]}, "joints"),
+        ({"camera": {}}, "camera"),
     ],
 )
 def test_faulty_frames_are_refused(parts: dict[str, Any], named: str) -> None:
@@ -218,5 +249,9 @@ def test_units_of_depth_are_told_apart() -> None:
     assert len(expected) == 16
     with pytest.raises(ParameterError, match="floats around 1200"):
         points_from_depth(np.full((4, 4), 1200.0), intrinsics, pose)
+    sparse = np.zeros((200, 201))
+    sparse[100, 150:] = 1200.0
+    with pytest.raises(ParameterError, match="floats around 1200"):
+        points_from_depth(sparse, intrinsics, pose)
     with pytest.raises(ParameterError, match="whole numbers up to 1"):
         points_from_depth(np.ones((4, 4), int), intrinsics, pose)

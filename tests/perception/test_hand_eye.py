@@ -10,7 +10,17 @@ import pinocchio as pin
 import pytest
 
 from apex_ompl.errors import ApexError, ParameterError
-from apex_ompl.perception import Board, Calibration, Camera, Frame, View, calibrate, look_at, save_sequence
+from apex_ompl.perception import (
+    Board,
+    Calibration,
+    Camera,
+    Frame,
+    View,
+    calibrate,
+    look_at,
+    measured_depths,
+    save_sequence,
+)
 from apex_ompl.perception.hand_eye import _Fit
 from apex_ompl.robot import Robot
 
@@ -79,6 +89,7 @@ def test_a_board_may_be_seen_in_part_or_not_at_all() -> None:
     [
         lambda: Board(kind="chessboard", columns=9, rows=7),
         lambda: BOARD.find(np.zeros((4, 4, 3))),
+        lambda: BOARD.find(np.zeros((0, 0, 3), np.uint8)),
         lambda: Board(dictionary="DICT_9X9").find(np.zeros((40, 40, 3), np.uint8)),
     ],
 )
@@ -172,6 +183,8 @@ def test_derivatives_are_those_of_differences(robot: Robot) -> None:
     ("change", "named"),
     [
         (lambda seen: seen[:3], "3 of 3"),
+        (lambda seen: None, "views"),
+        (lambda seen: [*seen, 1], "view 20"),
         (lambda seen: [View(one.state, one.pixels * np.nan) for one in seen], "0 of 20"),
         (lambda seen: [View(one.state[:5], one.pixels) for one in seen], "state of view 0"),
         (lambda seen: [View(one.state, one.pixels[:9]) for one in seen], "corners of view 0"),
@@ -199,34 +212,79 @@ def test_unknown_links_and_joints_are_refused(robot: Robot, options: dict[str, A
         calibrate(robot, CAMERA, BOARD, views(robot, "board on the hand", count=4), **options)
 
 
-def frames(robot: Robot, count: int = 8) -> list[Frame]:
-    """Return frames of the board on the hand, of an arm without offsets."""
+def frames(robot: Robot, count: int = 8, scale: float = 1.0, noise: float = 0.0) -> list[Frame]:
+    """Return frames of the board on the hand, of an arm without offsets, with a wall 20 cm behind the board.
+
+    Args:
+        robot: The robot.
+        count: Number of frames.
+        scale: Factor by which measured depths become true ones; 0 without depths.
+        noise: Standard deviation of a depth z over z^2 [1/m].
+    """
     off = OFF.copy()
     OFF.clear()
     try:
         seen = views(robot, "board on the hand", LARGE, count=count)
     finally:
         OFF.update(off)
-    camera, board = truth(robot, "board on the hand")
-    depth, eye = np.zeros((480, 640)), np.linalg.inv(camera.pose)
-    return [
-        Frame(
-            CAMERA, depth, picture(LARGE, eye @ robot.link_pose(one.state, LINK) @ board), float(k),
-            dict(zip(robot.joint_names, one.state, strict=True)),
-        )
-        for k, one in enumerate(seen)
-    ]  # fmt: skip
+    (camera, board), rng, made = truth(robot, "board on the hand"), np.random.default_rng(0), []
+    for k, one in enumerate(seen):
+        pose = np.linalg.inv(camera.pose) @ robot.link_pose(one.state, LINK) @ board
+        depth = depths(pose, rng, noise) / scale if scale else np.zeros((480, 640))
+        joints = dict(zip(robot.joint_names, one.state, strict=True))
+        made.append(Frame(CAMERA, depth, picture(LARGE, pose), float(k), joints))
+    return made
+
+
+def depths(pose: np.ndarray, rng: np.random.Generator, noise: float) -> np.ndarray:
+    """Return depths of a board that is 5 cm larger than its corners, before a wall, shape (480, 640) [m]."""
+    corners = [[x, y, 0.0] for x, y in np.abs(LARGE.corners[:, :2]).max(axis=0) * [[-1, -1], [1, -1], [1, 1], [-1, 1]]]
+    outline = CAMERA.project(1.3 * np.array(corners) @ pose[:3, :3].T + pose[:3, 3])
+    inside = cv2.fillConvexPoly(np.zeros((480, 640), np.uint8), np.round(outline).astype(np.int32), 1).astype(bool)
+    plane = (pose[:3, 2] @ pose[:3, 3]) / (CAMERA.grid @ pose[:2, 2] + pose[2, 2])
+    true = np.where(inside, plane, plane.max() + 0.2)
+    return true + noise * true**2 * rng.normal(size=true.shape)
 
 
 def test_frames_are_calibrated_by_the_command_line(robot: Robot, tmp_path: Path, apex_cli: Any) -> None:
     blank = Frame(CAMERA, np.zeros((480, 640)), np.zeros((480, 640, 3), np.uint8), 100.0, frames(robot, 1)[0].joints)
-    save_sequence([*frames(robot), blank], tmp_path / "frames")
+    save_sequence([*frames(robot, scale=0.0), blank], tmp_path / "frames")
     board = ("--board", "charuco:5x4:0.06")
     done = apex_cli("calibrate", tmp_path / "frames", *board, "--board-link", LINK, "-o", tmp_path / "camera.yaml")
-    assert done.returncode == 0 and "8 of 9 frames" in done.stdout
+    assert done.returncode == 0 and "8 of 9 frames" in done.stdout and "depth       as before" in done.stdout
     found = Camera.load(tmp_path / "camera.yaml")
     true, _ = truth(robot, "board on the hand")
     assert np.linalg.norm(found.pose[:3, 3] - true.pose[:3, 3]) < 5e-3
+
+
+def test_frames_of_two_cameras_are_refused(robot: Robot, tmp_path: Path, apex_cli: Any) -> None:
+    seen = frames(robot, 4)
+    other = CAMERA.model_copy(update={"focal": (470.0, 470.0)})
+    save_sequence([*seen, Frame(other, seen[0].depth, seen[0].color, 9.0, seen[0].joints)], tmp_path / "frames")
+    options = ("--board", "charuco:5x4:0.06", "--board-link", LINK, "-o", tmp_path / "camera.yaml")
+    done = apex_cli("calibrate", tmp_path / "frames", *options)
+    assert done.returncode == 2 and "frame 4: expected frames of one camera" in done.stderr
+
+
+def test_scale_and_noise_of_depths_are_found(robot: Robot, tmp_path: Path, apex_cli: Any) -> None:
+    seen = frames(robot, 8, scale=1.02, noise=0.004)
+    found = calibrated(
+        robot, "board on the hand", [View(f.state(robot.joint_names), LARGE.find(f.color)) for f in seen], LARGE
+    )
+    depth = measured_depths(found, robot, LARGE, seen, board_link=LINK)
+    assert depth is not None and abs(depth.scale - 1.02) < 0.002 and 1e-4 <= depth.scale_spread < 0.002
+    assert depth.noise == pytest.approx(0.004, rel=0.1)
+    assert measured_depths(found, robot, LARGE, seen[:3], board_link=LINK) is None
+    with pytest.raises(ParameterError, match="images of shape"):
+        small = Camera(width=64, height=48, focal=(46.5, 46.5), center=(32.0, 24.0))
+        measured_depths(
+            found, robot, LARGE, [Frame(small, np.ones((48, 64)), None, 0.0, seen[0].joints)], board_link=LINK
+        )
+    save_sequence(seen, tmp_path / "frames")
+    options = ("--board", "charuco:5x4:0.06", "--board-link", LINK, "-o", tmp_path / "camera.yaml")
+    done = apex_cli("calibrate", tmp_path / "frames", *options)
+    assert done.returncode == 0 and "depth       scale 1.0" in done.stdout
+    assert abs(Camera.load(tmp_path / "camera.yaml").depth.scale - 1.02) < 0.002
 
 
 @pytest.mark.parametrize(
@@ -238,6 +296,7 @@ def test_frames_are_calibrated_by_the_command_line(robot: Robot, tmp_path: Path,
         (("--board-link", "no_link"), "no_link"),
         (("--board-link", LINK, "--offsets", "no_joint"), "no_joint"),
         (("--board-link", LINK, "--camera", "none.yaml"), "none.yaml"),
+        (("--board-link", LINK, "--camera", "small.yaml"), "320 x 240"),
         (("--board-link", LINK, "--robot", "none"), "none"),
         ((), "board_link"),
         (("--board-link", LINK, "--board", "chessboard:9x6:0.03"), "0 of 4 show it"),
@@ -247,6 +306,8 @@ def test_faulty_options_are_named(
     robot: Robot, tmp_path: Path, apex_cli: Any, options: tuple[str, ...], named: str
 ) -> None:
     save_sequence(frames(robot, 4), tmp_path / "frames")
+    Camera(width=320, height=240, focal=(232.0, 232.0), center=(159.5, 119.5)).save(tmp_path / "small.yaml")
+    options = tuple(str(tmp_path / option) if option == "small.yaml" else option for option in options)
     board = ("--board", "charuco:5x4:0.06")
     done = apex_cli("calibrate", tmp_path / "frames", *board, *options, "-o", tmp_path / "camera.yaml")
     assert done.returncode == 2 and named in done.stderr and not (tmp_path / "camera.yaml").exists()

@@ -1,1 +1,1 @@
-"""Compiled functions of perception: triangles drawn as depth images, registration and fits of surfaces to depth."""
+"""Depth images: voxels looked up in them; triangles drawn as such, registration and fits of surfaces to depth."""

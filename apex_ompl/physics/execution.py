@@ -1,0 +1,254 @@
+"""Executing planned tasks in physics: hands close on what they hold, the steps are followed, and objects are judged.
+
+A plan takes objects to be rigidly held. Here hands hold them by friction where a rehearsal shows that it suffices, else
+by welds (:mod:`apex_ompl.drivers.grasps`). Each step begins once the hands have closed or opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, in_link, turned
+from apex_ompl.drivers.mujoco import MujocoDriver
+from apex_ompl.drivers.twin import TwinSettings
+from apex_ompl.drivers.vessels import filled
+from apex_ompl.physics.judges import Check, Intended, Judge
+from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun
+from apex_ompl.physics.trials import Trial
+from apex_ompl.planning.task_result import TaskResult, TaskStep
+from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.steps import GraspStep, ReleaseStep, Step
+from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.types import Array
+
+RATE = 100.0  # of the log [1/s]
+FILM_RATE = 24.0  # frames of a film [1/s]
+SETTLING, RESTING = 0.2, 1.0  # at rest before the first motion, and after the last one [s]
+SLIP, SLIP_ANGLE = 0.005, 0.1  # of objects that friction holds, at most, along a rehearsal [m, rad]
+STEEPEST = 0.3  # ratio of level acceleration to gravity of what stands on a tray, and of liquids, at most
+GRAVITY = 9.81  # [m/s^2]
+SAMPLES = 400  # of a motion
+HARD = 0.8, 1.2  # factors of friction and mass in a rehearsal
+
+Frames = list[Any]
+
+
+def rehearsed(robot: Robot, trial: Trial, motion: Trajectory, settings: TwinSettings = GRASPING) -> frozenset[str]:
+    """Return the names of the objects that friction holds along a motion, with less friction and more mass.
+
+    Args:
+        robot: The robot.
+        trial: The problem; its objects and masses are those of ``trial.known``.
+        motion: A motion to its goal.
+        settings: Settings of the model.
+    """
+    masses = {held.name: HARD[1] * (held.mass or 1.0) for held in trial.known.attached}
+    changes = {name: {"mass": mass, "inertia": None} for name, mass in masses.items()}
+    heavy = [held.model_copy(update=changes[held.name]) for held in trial.known.attached]
+    real = trial.known.model_copy(update={"attached": tuple(heavy)})
+    driver = MujocoDriver(robot, real, settings=replace(settings, friction=HARD[0] * settings.friction))
+    grasps = Grasps(driver)
+    single = {one.name: one.link for one in heavy if len(hands_of(robot, one)) == 1 and one.touch_links != ()}
+    grasps.friction &= single.keys()
+    first = {name: in_link(driver, name, link) for name, link in single.items()}
+    grasps.close()
+    slips = dict.fromkeys(single, (0.0, 0.0))
+
+    def watch() -> None:
+        for name, link in single.items():
+            now = in_link(driver, name, link)
+            most, angle = slips[name]
+            off = float(np.linalg.norm(now[:3, 3] - first[name][:3, 3]))
+            slips[name] = max(most, off), max(angle, turned(now, first[name]))
+
+    _advance(driver, driver.time + SETTLING, watch)
+    driver.send(motion, max(driver.time, driver.end))
+    _advance(driver, driver.end + SETTLING, watch)
+    return frozenset(name for name, (off, angle) in slips.items() if off <= SLIP and angle <= SLIP_ANGLE)
+
+
+class Executor:
+    """Executes one task.
+
+    Attributes:
+        driver: The robot.
+        grasps: Its hands.
+        frames: Frames of the film, where one is made.
+    """
+
+    def __init__(
+        self, robot: Robot, trial: Trial, plan: TaskResult, *, friction: Collection[str],
+        settings: TwinSettings = GRASPING, seed: int | None = None, film: tuple[int, int] | None = None,
+    ) -> None:  # fmt: skip
+        """Put the robot and the objects where the task starts.
+
+        Args:
+            robot: The robot.
+            trial: The start.
+            plan: The plan for ``trial.known``, with a motion.
+            friction: Names of the objects that friction holds; others are welded.
+            settings: Settings of the model.
+            seed: Seed of the start, for the result.
+            film: Width and height of a film [pixels].
+        """
+        own = replace(settings, friction=trial.friction * settings.friction)
+        self.robot, self.trial, self.plan, self.seed, self.film = robot, trial, plan, seed, film
+        self.driver = MujocoDriver(robot, trial.real, settings=own, assumed=trial.known)
+        self.grasps = Grasps(self.driver, friction)
+        self.frames: Frames = []
+        self._rows: list[tuple[float, Array, Array]] = []
+        self._poses: dict[str, list[Array]] = {held.name: [] for held in trial.real.attached}
+        self._steps: list[tuple[str, float, float]] = []
+
+    def run(self) -> TaskRun:
+        """Execute all steps, up to one in which the driver's guard stops the robot, and judge."""
+        driver, motion = self.driver, self.plan.trajectory
+        assert motion is not None
+        self.grasps.close()
+        self._wait(SETTLING)
+        standing = self._standing()
+        driver.forget()
+        lost = [one for one in self.grasps.found if one.kind == LOST]
+        after: list[Step | None] = [None, *self.plan.problem.after]
+        for planned, step in zip(self.plan.steps, after, strict=True):
+            if driver.fault:
+                break
+            self._follow(planned, step, motion_of(self.robot, self.trial.known, motion, planned))
+        self._wait(RESTING)
+        still = {body.name for body in (*self.trial.known.scene, *self.robot.fixtures)}
+        touched = [pair for pair in self._touched() if still & set(pair)]
+        end = self.plan.steps[-1].path.states[-1]
+        judge = Judge(self.trial.known, driver, intended(self.robot, self.plan), end, standing, touched)
+        checks = (*judge.checks(), Check("the robot follows its motion", not driver.fault, driver.fault or "it does"))
+        return self._result(checks, [f"{one.hand} did not get hold of {one.object}" for one in lost])
+
+    def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:
+        driver, begin = self.driver, self.driver.time
+        if isinstance(step, ReleaseStep):
+            self.grasps.open(step.hand)
+        if motion.duration > 0.0:
+            driver.send(motion, max(driver.time, driver.end))
+            self._to(driver.end)
+        if isinstance(step, ReleaseStep):
+            self.grasps.release(planned.released, step.hand, self._to)
+        if isinstance(step, GraspStep):
+            self.grasps.grasp(step.object, step.hand, self._to)
+        self._steps.append((planned.title, round(begin, 4), round(driver.time, 4)))
+
+    def _standing(self) -> dict[str, tuple[str, Array]]:
+        """Return what stands on what, of objects that no link may touch, liquids apart."""
+        found = {}
+        for one in self.trial.known.attached:
+            below = [other for other in self.trial.known.attached if other.name != one.name and other.link == one.link]
+            if one.touch_links == () and below:
+                found[one.name] = below[0].name, in_link(self.driver, one.name, below[0].name)
+        return found
+
+    def _wait(self, seconds: float) -> None:
+        self._to(self.driver.time + seconds)
+
+    def _to(self, until: float) -> None:
+        _advance(self.driver, until, self._note)
+
+    def _note(self) -> None:
+        driver = self.driver
+        state = driver.state()
+        self._rows.append((driver.time, driver.commanded(), state.positions))
+        for name, rows in self._poses.items():
+            body = driver.data.body(name)
+            rows.append(np.concatenate([body.xpos, body.xquat]))
+        if self.film is not None and driver.time * FILM_RATE >= len(self.frames):
+            self.frames.append(driver.picture(self.film))
+
+    def _result(self, checks: Sequence[Check], lost: Sequence[str]) -> TaskRun:
+        failed = [f"{one.name}: {one.found}" for one in checks if not one.passed]
+        outcome = DROPPED if lost and failed else FAILED if failed else DONE
+        reason = "; ".join([*(lost if failed else ()), *failed])
+        times, commanded, measured = (np.array([row[k] for row in self._rows]) for k in range(3))
+        happened = self.driver.execution
+        arms = [k for k, name in enumerate(self.robot.joint_names) if name not in self._synergies()]
+        metrics = {
+            "duration": float(self.driver.time), "tracking_error": float(happened.tracking_error[:, arms].max()),
+            "torque_use": float(np.nan_to_num(happened.torque_use[:, arms]).max()),
+        }  # fmt: skip
+        return TaskRun(
+            self.plan.problem.name, self.seed, outcome, reason, tuple(self.grasps.found), tuple(checks),
+            tuple(self._steps), times, commanded, measured,
+            {name: np.array(rows) for name, rows in self._poses.items()}, self._touched(), metrics,
+        )  # fmt: skip
+
+    def _synergies(self) -> set[str]:
+        return {str(hand.synergy) for hand in self.robot.hands.values()}
+
+    def _touched(self) -> dict[tuple[str, str], float]:
+        """Return contacts of links with anything but the objects that the problem holds."""
+        objects, links = {one.name for one in self.trial.real.attached}, set(self.robot.link_names)
+        return {
+            pair: depth for pair, depth in self.driver.contacts.items() if set(pair) & links and not set(pair) & objects
+        }
+
+
+def _advance(driver: MujocoDriver, until: float, watch: Callable[[], None]) -> None:
+    """Simulate up to a time, and call a function at the rate of the log."""
+    begin = driver.time
+    for k in range(1, int(np.ceil((until - begin) * RATE)) + 1):
+        driver.advance(max(driver.time, min(until, begin + k / RATE)))
+        watch()
+
+
+def motion_of(robot: Robot, problem: Problem, motion: Trajectory, step: TaskStep) -> Trajectory:
+    """Return the part of a motion that is a step, slowed down where what stands or flows would fall or spill.
+
+    Args:
+        robot: The robot.
+        problem: The problem.
+        motion: The motion through all steps.
+        step: The step, at rest at both ends.
+    """
+    first, last = (int(np.argmin(np.abs(motion.times - time))) for time in (step.start, step.end))
+    inside = slice(first, last + 1)
+    times = motion.times[inside] - motion.times[first]
+    part = Trajectory(
+        times, motion.positions[inside], motion.velocities[inside], motion.accelerations[inside], motion.joint_names
+    )  # fmt: skip
+    full = filled(problem)
+    loose = [held for held in step.attached if held.touch_links == () or held.name in full]
+    s = min((_gentle(robot, held, part) for held in loose), default=1.0)
+    return Trajectory(times / s, part.positions, s * part.velocities, s * s * part.accelerations, part.joint_names)
+
+
+def _gentle(robot: Robot, held: AttachedObject, motion: Trajectory) -> float:
+    """Return the factor of the speed of a motion at which an object's level acceleration is small enough."""
+    if motion.duration <= 0.0:
+        return 1.0
+    times = np.linspace(0.0, motion.duration, SAMPLES)
+    places = np.array([(robot.link_pose(q, held.link) @ held.pose)[:3, 3] for q in motion(times)])
+    a = np.diff(places, 2, axis=0) / (times[1] - times[0]) ** 2
+    need = np.linalg.norm(a[:, :2], axis=1) - STEEPEST * a[:, 2]
+    return float(min(1.0, np.sqrt(STEEPEST * GRAVITY / max(float(need.max()), 1e-9))))
+
+
+def intended(robot: Robot, plan: TaskResult) -> Mapping[str, Intended]:
+    """Return where a plan has the objects at the end."""
+    found: dict[str, Intended] = {}
+    for planned, step in zip(plan.steps, (None, *plan.problem.after), strict=True):
+        for held in planned.attached:
+            found[held.name] = Intended(held.name, held.link, held.pose)
+        if not isinstance(step, ReleaseStep):
+            continue
+        links, end = robot.hand_of(robot.hands[step.hand].palm), planned.path.states[-1]
+        for name in planned.released:
+            one = next(held for held in planned.attached if held.name == name)
+            pose = robot.link_pose(end, one.link) @ one.pose
+            others = [link for link in one.holders if link not in links]
+            if others:
+                found[name] = Intended(name, others[0], np.linalg.inv(robot.link_pose(end, others[0])) @ pose)
+            else:
+                found[name] = Intended(name, "", pose, name in planned.gone)
+    return found

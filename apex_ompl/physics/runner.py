@@ -1,0 +1,121 @@
+"""Planning tasks and executing them in physics, from the start of a problem or from starts drawn by seed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.drivers.grasps import GRASPING
+from apex_ompl.drivers.twin import TwinSettings
+from apex_ompl.drivers.vessels import filled
+from apex_ompl.errors import ParameterError
+from apex_ompl.physics.execution import Executor, motion_of, rehearsed
+from apex_ompl.physics.result import UNPLANNED, TaskRun
+from apex_ompl.physics.trials import Spread, Trial, draw
+from apex_ompl.planning.planner import MotionPlanner
+from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.robot import load_robot
+from apex_ompl.scene.constraints import Upright
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.validation import check_integer, check_name, check_positive
+
+TIMEOUT = 30.0  # of planning [s]
+SPILLING = 1.45  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
+
+
+@dataclass(eq=False)
+class TaskRunner:
+    """Executes a problem in physics, from any number of starts.
+
+    Attributes:
+        problem: The problem; its obstacles stand still.
+        spread: How far starts are from the problem.
+        settings: Settings of the model.
+        timeout: Of each plan [s].
+        friction: Names of the objects that friction holds; by default those of a rehearsal from the problem's start.
+    """
+
+    problem: Problem
+    spread: Spread = field(default_factory=Spread)
+    settings: TwinSettings = GRASPING
+    timeout: float = TIMEOUT
+    friction: Collection[str] | None = None
+
+    def __post_init__(self) -> None:
+        """Load the robot.
+
+        Raises:
+            ParameterError: An obstacle moves, fingers do not yield, or the timeout is not positive.
+            UnknownNameError: There is no held object of a name in ``friction``.
+            ApexError: The robot is unknown or faulty.
+        """
+        if self.problem.moving:
+            raise ParameterError("problem", self.problem.moving[0], "obstacles that stand still")
+        if self.settings.finger_stiffness is None:
+            raise ParameterError("settings.finger_stiffness", None, "a stiffness: fingers yield to what they grasp")
+        for name in self.friction or ():
+            check_name(name, "held object in friction", [held.name for held in self.problem.attached])
+        check_positive(self.timeout, "timeout")
+        self.robot = load_robot(self.problem.robot)
+        self._planner = MotionPlanner(self.robot)
+
+    def run(self, seed: int | None = None, film: tuple[int, int] | None = None) -> tuple[TaskRun, list[Any]]:
+        """Execute the task once.
+
+        Args:
+            seed: Seed of the start; by default it is that of the problem.
+            film: Width and height of a film [pixels].
+
+        Returns:
+            What happened, and the frames of the film.
+
+        Raises:
+            ApexError: The problem is faulty.
+            ParameterError: The seed is negative.
+        """
+        if seed is not None:
+            check_integer(seed, "seed", 0)
+        if self.friction is None:
+            self.friction = self._rehearsed()
+        trial = draw(self.robot, self.problem, seed, self.spread, self.settings.density)
+        plan = self._plan(trial, seed or 0)
+        if not plan or plan.trajectory is None:
+            return unplanned(self.problem, seed, plan), []
+        executor = Executor(
+            self.robot, trial, plan, friction=self.friction, settings=self.settings, seed=seed, film=film
+        )  # fmt: skip
+        return executor.run(), executor.frames
+
+    def _rehearsed(self) -> frozenset[str]:
+        """Return the names of the objects that friction holds from the start of the problem to the goal."""
+        trial = draw(self.robot, self.problem, None, self.spread, self.settings.density)
+        if not any(held.links is None and held.touch_links != () for held in trial.known.attached):
+            return frozenset()
+        plan = self._plan(trial, 0)
+        if not plan or plan.trajectory is None:
+            return frozenset()
+        motion = motion_of(self.robot, trial.known, plan.trajectory, plan.steps[0])
+        return rehearsed(self.robot, trial, motion, self.settings)
+
+    def _plan(self, trial: Trial, seed: int) -> TaskResult:
+        known = trial.known
+        return self._planner.plan_task(known, timeout=self.timeout, seed=seed, constraints=self._level(known))
+
+    def _level(self, problem: Problem) -> tuple[Upright, ...]:
+        """Return constraints by which full vessels do not tilt too far on the way to the goal."""
+        upright = {one.frame for one in problem.constraints if isinstance(one, Upright)}
+        axes = {one.name: one.contact.axis for one in problem.attached if one.contact is not None}
+        full = [name for name in filled(problem) if name not in upright]
+        return tuple(Upright(frame=name, axis=axes[name], angle=SPILLING) for name in full)
+
+
+def unplanned(problem: Problem, seed: int | None, plan: TaskResult) -> TaskRun:
+    """Return the result of a task that was not planned."""
+    nothing = np.empty((0, 0))
+    return TaskRun(
+        problem.name, seed, UNPLANNED, f"{plan.status}: {plan.reason}", (), (), (), np.empty(0), nothing, nothing, {},
+        {}, {},
+    )  # fmt: skip

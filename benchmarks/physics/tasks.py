@@ -1,0 +1,126 @@
+"""Ready-made problems executed in physics to the end, from starts that differ from what the plan knows.
+
+Each start is drawn by seed: joints of the arms within 0.02 rad, which are measured, and what is not: objects within
+5 mm in the hands, masses and friction within 20 %. A run succeeds where the objects are where they should be
+(:mod:`apex_ompl.physics.judges`). Runs are stored in benchmarks/runs/tasks when they end; the command resumes.
+
+Usage: python -m benchmarks.physics.tasks [PROBLEM ...] [-n 40] [--report]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from apex_ompl import problems
+from apex_ompl.drivers.library import mujoco
+from apex_ompl.physics import Spread, TaskRunner
+from apex_ompl.physics.result import UNPLANNED, TaskRun
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import write_atomically
+from apex_ompl.util.statistics import share_interval
+from benchmarks.lib import record
+from benchmarks.lib.pack import RUNS
+
+DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/drivers", "apex_ompl/physics")
+FOLDER = RUNS / "tasks"
+TIMEOUT = 120.0  # of a plan [s]
+LINKS = frozenset(robot().link_names)
+HEAD = (
+    "problem", "N", "succeeded", "95 % interval", "held by", "duration s p50", "CPU s p50", "links touched obstacles",
+    "failures",
+)  # fmt: skip
+
+
+def row_of(run: TaskRun, seconds: float) -> dict[str, Any]:
+    """Return what is stored of a run."""
+    failed = [f"{check.name}: {check.found}" for check in run.checks if not check.passed]
+    obstacles = [list(pair) for pair in sorted(run.contacts) if not set(pair) <= LINKS]
+    return {
+        "seed": run.seed, "outcome": run.outcome, "reason": run.reason, "failed": failed, "causes": causes(run),
+        "grasps": [[one.object, one.hand, one.kind] for one in run.grasps], "metrics": dict(run.metrics),
+        "obstacles": obstacles, "cpu": round(seconds, 3),
+    }  # fmt: skip
+
+
+def causes(run: TaskRun) -> list[str]:
+    """Return why a run failed: hands that got hold of nothing, the conditions that do not hold, or the planner's."""
+    if run:
+        return []
+    if run.outcome == UNPLANNED:
+        return [f"not planned: {run.reason.split(';')[0]}"]
+    return [f"not: {check.name}" for check in run.checks if not check.passed]
+
+
+def stored(name: str, seeds: Sequence[int], folder: Path) -> list[dict[str, Any]]:
+    """Make the runs of a problem that are missing, and return all."""
+    files = [folder / f"{name}.{seed}.json" for seed in seeds]
+    runner = TaskRunner(problems.load(name), Spread(), timeout=TIMEOUT)
+    for seed, file in zip(seeds, tqdm(files, desc=name, mininterval=10.0), strict=True):
+        if file.exists():
+            continue
+        started = time.process_time()
+        run, _ = runner.run(seed)
+        data = row_of(run, time.process_time() - started)
+        write_atomically(file, (json.dumps(data, indent=1) + "\n").encode())
+    return [json.loads(file.read_text()) for file in files]
+
+
+def cells(name: str, rows: Sequence[dict[str, Any]]) -> list[Any]:
+    """Return the cells of a problem."""
+    done = sum(row["outcome"] == "DONE" for row in rows)
+    low, high = share_interval(done, len(rows))
+    held = sorted({f"{thing} {kind}" for row in rows for thing, _, kind in row["grasps"]})
+    durations = [row["metrics"]["duration"] for row in rows if row["metrics"]]
+    counted = Counter(cause for row in rows for cause in row["causes"])
+    return [
+        name, len(rows), done, f"{low:.2f} to {high:.2f}", ", ".join(held),
+        f"{record.percentiles(durations, 50)[0]:.1f}", f"{np.median([row['cpu'] for row in rows]):.1f}",
+        sum(bool(row["obstacles"]) for row in rows),
+        "; ".join(f"{number} {cause}" for cause, number in counted.most_common()),
+    ]  # fmt: skip
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser."""
+    found = record.parser(__doc__ or "", n=40, of="starts of a problem")
+    found.add_argument("problems", nargs="*", default=list(problems.names()), help="default: all ready-made ones")
+    found.add_argument("--seed", type=int, default=1, help="of the first start (default: %(default)s)")
+    found.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
+    found.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
+    return found
+
+
+def main() -> None:
+    """Make the runs, and write the results."""
+    given = parser().parse_args()
+    given.store.mkdir(parents=True, exist_ok=True)
+    seeds = range(given.seed, given.seed + given.n)
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name in given.problems:
+        if given.report:
+            files = (given.store / f"{name}.{seed}.json" for seed in seeds)
+            found[name] = [json.loads(file.read_text()) for file in files if file.exists()]
+        else:
+            found[name] = stored(name, seeds, given.store)
+    found = {name: rows for name, rows in found.items() if rows}
+    lines = [record.row(list(HEAD)), record.row(["---"] * len(HEAD))]
+    lines += [record.row(cells(name, rows)) for name, rows in found.items()]
+    total = [row for rows in found.values() for row in rows]
+    done = sum(row["outcome"] == "DONE" for row in total)
+    lines.append(record.row(["all of them", len(total), done, *[""] * (len(HEAD) - 3)]))
+    settings = {"n": given.n, "seed": given.seed, "timeout": TIMEOUT, "mujoco": mujoco().__version__}
+    record.write("physics_tasks", {"runs": found, "spread": vars(Spread())}, "\n".join(lines), **settings)
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,184 @@
+"""Tasks that are planned and executed in physics, from Python and by ``apex-ompl run PROBLEM --driver mujoco``."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from physics import library
+from planning import cached_problem
+
+from apex_ompl import plan_task
+from apex_ompl.cli import main, physics
+from apex_ompl.drivers import TwinSettings
+from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
+from apex_ompl.physics import Spread, TaskRun, TaskRunner, execution
+from apex_ompl.physics.execution import GRAVITY, STEEPEST, intended, motion_of
+from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
+
+library()
+SECONDS = 120.0
+# Poses in which friction holds the boxes of stack_boxes, of scripts/find_grasps.py, and the synergies before contact.
+HELD_BY_FRICTION: dict[str, dict[str, Any]] = {
+    "lower": {"position": (0.0305, -0.0046, -0.0451), "orientation": (0.652896, 0.328218, -0.626318, 0.271524)},
+    "upper": {"position": (-0.0329, -0.0023, -0.0441), "orientation": (-0.271131, -0.646378, -0.29065, 0.651311)},
+}
+SYNERGIES = {"left_hand_synergy": 0.259, "right_hand_synergy": 0.284}
+
+
+@cache
+def stacked() -> TaskRun:
+    return TaskRunner(cached_problem("stack_boxes"), Spread(), timeout=SECONDS).run(3)[0]
+
+
+def test_boxes_are_stacked_from_a_drawn_start() -> None:
+    run = stacked()
+    assert run and run.outcome == "DONE" and run.reason == "" and run.seed == 3
+    assert [(one.object, one.hand, one.kind) for one in run.grasps] == [
+        ("lower", "left_hand", "weld"), ("upper", "right_hand", "weld"),
+    ]  # fmt: skip
+    assert all(len(one.links) >= 2 and one.force > 0.6 for one in run.grasps)
+    titles = ["goal", "line upper onto lower", "release all by right_hand", "retreat right_hand"]
+    assert [title for title, _, _ in run.steps] == titles
+    lower, upper = run.poses["lower"], run.poses["upper"]
+    assert 0.13 < np.linalg.norm(upper[-1, :3] - lower[-1, :3]) < 0.15  # boxes of 140 mm, one on the other
+    assert np.abs(upper[-1, :3] - upper[-20, :3]).max() < 1e-4 and upper[-1, 2] > lower[-1, 2]
+    assert np.abs(run.measured - run.commanded)[:, :14].max() < 5e-3
+
+
+def test_a_seed_is_one_run() -> None:
+    again = TaskRunner(cached_problem("stack_boxes"), Spread(), timeout=SECONDS).run(3)[0]
+    assert np.array_equal(again.measured, stacked().measured)
+    assert np.array_equal(again.poses["upper"], stacked().poses["upper"])
+
+
+def test_objects_that_nothing_holds_fall() -> None:
+    """At the problem's poses friction does not suffice, which a rehearsal finds."""
+    run, _ = TaskRunner(cached_problem("stack_boxes"), timeout=SECONDS, friction={"lower", "upper"}).run()
+    assert run.outcome == "FAILED" and not run and "lower is held by left_hand: " in run.reason
+    assert run.poses["lower"][-1, 2] < run.poses["lower"][0, 2] - 0.1
+    assert {one.kind for one in run.grasps} == {"friction"}
+
+
+def test_boxes_are_stacked_by_friction_where_the_poses_are_good() -> None:
+    problem = cached_problem("stack_boxes")
+    held = tuple(one.model_copy(update=HELD_BY_FRICTION[one.name]) for one in problem.attached)
+    problem = problem.model_copy(update={"attached": held, "start": dict(problem.start) | SYNERGIES})
+    runner = TaskRunner(problem, timeout=SECONDS)
+    run, _ = runner.run()
+    assert runner.friction == {"lower", "upper"}
+    assert run, run.reason
+    assert {one.kind for one in run.grasps} == {"friction"}
+
+
+def test_steps_are_slow_enough_for_what_stands_and_flows(robot: Robot) -> None:
+    problem = cached_problem("carry_tray")
+    plan = plan_task(problem, timeout=SECONDS)
+    assert plan.trajectory is not None
+    motion = motion_of(robot, problem, plan.trajectory, plan.steps[0])
+    assert motion.duration > 1.05 * plan.trajectory.duration
+    assert np.array_equal(motion.positions, plan.trajectory.positions)
+    times, cargo = np.linspace(0.0, motion.duration, 300), problem.attached[1]
+    places = np.array([(robot.link_pose(q, cargo.link) @ cargo.pose)[:3, 3] for q in motion(times)])
+    a = np.diff(places, 2, axis=0) / (times[1] - times[0]) ** 2
+    ratio = np.linalg.norm(a[:, :2], axis=1) / (GRAVITY + a[:, 2])
+    assert ratio.max() == pytest.approx(STEEPEST, rel=0.1)
+    assert (np.abs(motion.velocities) / robot.limits.velocity).max() <= 1.0
+    assert (np.abs(motion.accelerations) / robot.limits.acceleration).max() <= 1.0
+
+
+def test_objects_are_intended_where_the_plan_leaves_them(robot: Robot) -> None:
+    plan = plan_task("handover", timeout=SECONDS)
+    bar = intended(robot, plan)["bar"]
+    end = plan.steps[-1].path.states[-1]
+    assert bar.link == "right_hand_palm" and not bar.falls
+    assert plan.trajectory is not None
+    np.testing.assert_allclose(
+        robot.link_pose(end, bar.link) @ bar.pose, plan.object_poses(robot, plan.trajectory.duration)["bar"], atol=1e-6
+    )
+
+
+def test_the_command_writes_log_and_film(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(physics, "SIZE", (96, 64))
+    monkeypatch.setattr(execution, "FILM_RATE", 4.0)
+    log, film = tmp_path / "run.npz", tmp_path / "run.mp4"
+    code = main(
+        ["run", "reach_past_post", "--driver", "mujoco", "--timeout", "120", "--out", str(log), "--film", str(film)]
+    )
+    if code != 0:
+        assert "OpenGL" in capsys.readouterr().err
+        pytest.skip("no OpenGL")
+    text = capsys.readouterr().out
+    assert "DONE" in text and "yes  left_hand is where the plan ends" in text
+    with np.load(log) as data:
+        rows = len(data["times"])
+        assert data["measured"].shape == (rows, 16) and rows > 100
+    assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_logs_are_written_as_text(tmp_path: Path) -> None:
+    stacked().save(tmp_path / "run.json")
+    data = json.loads((tmp_path / "run.json").read_text())
+    assert data["outcome"] == "DONE" and data["problem"] == "stack_boxes" and len(data["checks"]) == 6
+    assert len(data["pose upper"]) == len(data["times"]) == len(stacked().times)
+    with pytest.raises(ParameterError, match="csv"):
+        stacked().save(tmp_path / "run.csv")
+
+
+def test_what_is_not_planned_says_so(robot: Robot, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem = cached_problem("reach_past_post")
+    hand = robot.link_pose(problem.goal_states(robot.joint_names)[0], "left_hand_palm")[:3, 3]
+    block = Obstacle(name="block", box=(0.1, 0.1, 0.1), position=tuple(hand.tolist()))
+    blocked, log, film = tmp_path / "blocked.yaml", tmp_path / "run.json", tmp_path / "run.mp4"
+    problem.model_copy(update={"scene": (*problem.scene, block)}).save(blocked)
+    assert main(["run", str(blocked), "--driver", "mujoco", "--out", str(log), "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["outcome"] == json.loads(log.read_text())["outcome"] == "NOT_PLANNED"
+    assert "block" in json.loads(log.read_text())["reason"]
+    assert main(["run", str(blocked), "--driver", "mujoco", "--film", str(film)]) == 2
+    assert "--film" in capsys.readouterr().err and not film.exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "match", "given"),
+    [
+        (ParameterError, "finger_stiffness", {"settings": TwinSettings()}),
+        (ParameterError, "timeout", {"timeout": np.nan}),
+        (ParameterError, "timeout", {"timeout": 0.0}),
+        (UnknownNameError, "uper", {"friction": ("uper",)}),
+    ],
+)
+def test_runners_refuse_bad_input(error: type[ApexError], match: str, given: dict[str, Any]) -> None:
+    with pytest.raises(error, match=match):
+        TaskRunner(cached_problem("stack_boxes"), **given)
+
+
+def test_seeds_are_not_negative() -> None:
+    with pytest.raises(ParameterError, match="seed"):
+        TaskRunner(cached_problem("reach_past_post")).run(-1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["stack_boxes", "--driver", "gazebo"], "driver 'gazebo'"),
+        (["stack_boxes", "--film", "f.mp4"], "--driver mujoco"),
+        (["stack_boxes", "--driver", "mujoco", "--film", "f.gif"], "f.gif"),
+        (["stack_boxes", "--driver", "mujoco", "--out", "log.csv"], "log.csv"),
+        (["stack_boxes", "--driver", "mujoco", "--out", "nowhere/log.json"], "nowhere"),
+        (["stack_boxes", "--driver", "mujoco", "--seed", "-1"], "seed"),
+        (["stack_boxes", "--driver", "mujoco", "--timeout", "nan"], "timeout"),
+        (["stackboxes", "--driver", "mujoco"], "stackboxes"),
+        (["vertical/moving-large-0.1/900001", "--driver", "mujoco"], "stand still"),
+    ],
+)
+def test_the_command_refuses_bad_input(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", *arguments]) == 2
+    err = capsys.readouterr().err
+    assert message in err and "Traceback" not in err and err.count("\n") == 1
