@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from apex_ompl.perception.alignment import AlignSettings as AlignSettings
+    from apex_ompl.perception.alignment import SeenTask as SeenTask
+    from apex_ompl.perception.alignment import vect_align as vect_align
     from apex_ompl.perception.bags import bag_frames as bag_frames
     from apex_ompl.perception.boards import Board as Board
     from apex_ompl.perception.camera import Camera as Camera
@@ -19,6 +22,12 @@ if TYPE_CHECKING:
     from apex_ompl.perception.hand_eye import Calibration as Calibration
     from apex_ompl.perception.hand_eye import View as View
     from apex_ompl.perception.hand_eye import calibrate as calibrate
+    from apex_ompl.perception.held import HeldObject as HeldObject
+    from apex_ompl.perception.held import HeldObjectFinder as HeldObjectFinder
+    from apex_ompl.perception.held import HeldSettings as HeldSettings
+    from apex_ompl.perception.obstacles import ObstacleFinder as ObstacleFinder
+    from apex_ompl.perception.obstacles import ObstacleSettings as ObstacleSettings
+    from apex_ompl.perception.obstacles import SeenObstacle as SeenObstacle
     from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
     from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
     from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
@@ -28,12 +37,15 @@ if TYPE_CHECKING:
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "alignment": "AlignSettings SeenTask vect_align",
         "bags": "bag_frames",
         "boards": "Board",
         "camera": "Camera DepthErrors look_at",
         "depth_scale": "measured_depths",
         "frames": "Frame load_frames save_sequence",
         "hand_eye": "Calibration View calibrate",
+        "held": "HeldObject HeldObjectFinder HeldSettings",
+        "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",
         "synchronizer": "Synchronizer",

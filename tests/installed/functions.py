@@ -377,6 +377,43 @@ def _use_perception() -> None:
     _use_map(camera.placed(eye))
     _use_messages(camera)
     _use_twin_camera(camera.placed(eye))
+    _use_fits()
+
+
+def _use_fits() -> None:
+    """Held objects and an obstacle in a drawn scene, and the task that it shows."""
+    import apex_ompl
+    from apex_ompl.perception import (
+        AlignSettings,
+        HeldObjectFinder,
+        HeldSettings,
+        ObstacleFinder,
+        ObstacleSettings,
+        SeenObstacle,
+        SeenTask,
+        vect_align,
+    )
+    from apex_ompl.perception.registration import corrected
+    from apex_ompl.perception.surfaces import RobotSurface
+    from apex_ompl.perception.synthetic import SceneGenerator, SyntheticSettings
+    from apex_ompl.problems.objects import DATA
+    from apex_ompl.scene.problem import Alignment
+
+    robot = apex_ompl.load_robot("dual_panda_softhand")
+    drawn = SceneGenerator(robot, DATA).draw(np.random.default_rng(0), SyntheticSettings(colors=True, obstacle="cube"))
+    frame, attached = drawn.frames[0], [one.reported for one in drawn.objects]
+    finder = HeldObjectFinder(robot, attached, HeldSettings())
+    for one in (*finder.find(frame), *finder.by_grasp(frame)):
+        assert one.face.shape == one.axis.shape == (3,) and one.face_covariance.shape == (3, 3)
+        assert one.name and one.face_spread > 0.0 and one.axis_spread > 0.0
+    assert frame.color is not None and len(finder.expected(robot.home)) == 2
+    obstacles = ObstacleFinder(ObstacleSettings())
+    assert obstacles.colored(frame.color).any()
+    for seen in obstacles.find(corrected(frame, RobotSurface(robot), None), frame.color):
+        assert isinstance(seen, SeenObstacle) and seen.place_spread > 0.0 and seen.obstacle("red", 1.0).name == "red"
+    alignment = Alignment(kind="vertical", first=attached[0].name, second=attached[1].name)
+    task = vect_align(frame, robot, attached, alignment, AlignSettings(obstacles=None))
+    assert isinstance(task, SeenTask) and bool(task) == (not task.reasons)
 
 
 def _use_map(camera: Any) -> None:

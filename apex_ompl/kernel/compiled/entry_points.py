@@ -349,6 +349,23 @@ OTHERS: Functions = {
         + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]",
         6,
     ),
+    "perception.rasterizer.place_vertices": ("f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1]", 1),
+    "perception.rasterizer.draw_triangles": ("f8[:, ::1], i8[:, ::1], f8[::1], f8[:, ::1], i8[:, ::1]", 1),
+    "perception.registration.register_rows": (
+        "f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, :, ::1], f8[::1], i8, f8[::1], f8, f8, f8, "
+        "f8, f8[:, ::1], f8[::1], f8[::1]",
+        1,
+    ),
+    "perception.surface_fit.select_points": (
+        "f8[:, ::1], f8[:, ::1], f8[:, ::1], i8, i8, i8, f8[::1], f8[::1], f8, f8, f8, f8[:, ::1], f8[:, ::1]",
+        1,
+    ),
+    "perception.surface_fit.fit_surface": (
+        "f8[:, ::1], i8, f8[:, ::1], f8[::1], f8[:, ::1], i8[:, ::1], i8[::1], i8, f8[:, ::1], f8[::1], f8[::1], "
+        "f8[:, ::1], f8[::1], f8[:, ::1], Tuple((f8, f8, f8, f8, f8, f8, f8, f8)), i8, f8[:, ::1], f8[:, ::1], "
+        "i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]",
+        3,
+    ),
     "perception.voxels.block_depths": ("f4[::1], i8[::1], i1[::1], f8, f8, f8, f4[:, :, ::1]", 1),
     "perception.voxels.mark_inside": (
         "f4[::1], f4[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], i1[::1]",

@@ -1,1 +1,1 @@
-"""Depth images: pixels in blocks, voxels looked up in them."""
+"""Depth images: voxels looked up in them; triangles drawn as such, registration and fits of surfaces to depth."""

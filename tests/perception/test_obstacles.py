@@ -1,0 +1,136 @@
+"""Obstacles of a color in drawn frames, against the truth."""
+
+from __future__ import annotations
+
+import colorsys
+
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.perception.camera import Camera, DepthErrors, look_at
+from apex_ompl.perception.registration import CorrectedFrame, Registration
+from apex_ompl.perception.rendering import DepthSensor, Light, Part, ZBuffer, colors
+from apex_ompl.perception.synthetic import solid_part
+
+pytest.importorskip("cv2")
+
+from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle  # noqa: E402
+
+CAMERA = Camera(width=320, height=240, focal=(232.0, 232.0), center=(159.5, 119.5), depth=DepthErrors())
+EYE = look_at((1.0, 0.1, 0.9), (0.3, 0.0, 0.3))
+RED, GREEN, GRAY = (0.75, 0.06, 0.06), (0.1, 0.6, 0.1), (0.6, 0.6, 0.6)
+LIGHT = Light((-0.3, -0.5, -0.8), 0.4, (1.0, 1.0, 1.0), 1.0)
+
+
+def placed(x: float, y: float, z: float, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    return np.asarray(pin.SE3(pin.exp3(np.array(turn)), np.array([x, y, z])).homogeneous)
+
+
+def found_in(
+    parts: list[Part], settings: ObstacleSettings | None = None, gain: float = 0.5, seed: int = 0
+) -> tuple[SeenObstacle, ...]:
+    rng = np.random.default_rng(seed)
+    floor = solid_part(coal.Box(4.0, 4.0, 0.02), placed(0.0, 0.0, 0.0), 9, GRAY)
+    everything = [*parts, floor]
+    view = ZBuffer().draw(everything, CAMERA, EYE)
+    depth = DepthSensor(gain=gain).measure(view, CAMERA, rng)[0]
+    known = Registration(EYE, 1.0, np.zeros(0), np.diag([1e-4] * 3 + [3e-4] * 3 + [1e-4]) ** 2, 0, 0)
+    seen = CorrectedFrame(CAMERA, depth, known, gain * CAMERA.depth.noise)
+    return ObstacleFinder(settings).find(seen, colors(view, everything, LIGHT, rng))
+
+
+CASES = {
+    "cube": (coal.Box(0.12, 0.12, 0.12), placed(0.3, 0.0, 0.3, (0.0, 0.0, 0.5)), (0.12, 0.12, 0.12)),
+    "lying box": (coal.Box(0.1, 0.25, 0.15), placed(0.3, 0.1, 0.3, (0.6, 0.3, 0.2)), (0.1, 0.25, 0.15)),
+    "standing cylinder": (coal.Cylinder(0.06, 0.2), placed(0.3, -0.1, 0.2), (0.12, 0.12, 0.2)),
+    "lying cylinder": (coal.Cylinder(0.05, 0.22), placed(0.3, 0.0, 0.2, (1.2, 0.4, 0.0)), (0.1, 0.1, 0.22)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_solids_are_found_whatever_their_turn(case: str) -> None:
+    solid, pose, size = CASES[case]
+    (found,) = found_in([solid_part(solid, pose, 5, RED)])
+    assert found.kind == ("box" if isinstance(solid, coal.Box) else "cylinder")
+    assert np.linalg.norm(found.pose[:3, 3] - pose[:3, 3]) < 0.012
+    np.testing.assert_allclose(np.sort(found.size), np.sort(size), atol=0.012)
+    assert not found.cut
+    off = found.pose[:3, 3] - pose[:3, 3]
+    assert off @ np.linalg.solve(found.covariance[3:6, 3:6], off) < 25.0
+    assert 1e-4 < found.place_spread < 0.02
+
+
+def test_a_cube_s_axes_are_those_of_the_truth() -> None:
+    solid, pose, _ = CASES["cube"]
+    (found,) = found_in([solid_part(solid, pose, 5, RED)])
+    along = np.abs(found.pose[:3, :3].T @ pose[:3, :3])
+    np.testing.assert_allclose(np.sort(along, axis=1)[:, 2], 1.0, atol=0.005)
+
+
+def test_other_colors_are_no_obstacles_and_other_red_things_are_others() -> None:
+    solid, pose, _ = CASES["cube"]
+    parts = [
+        solid_part(solid, pose, 5, RED),
+        solid_part(coal.Box(0.1, 0.1, 0.1), placed(0.1, -0.35, 0.2), 6, GREEN),
+        solid_part(coal.Box(0.1, 0.1, 0.1), placed(0.1, 0.35, 0.1), 7, RED),
+    ]
+    found = found_in(parts)
+    assert len(found) == 2
+    assert np.linalg.norm(found[0].pose[:3, 3] - pose[:3, 3]) < 0.01
+    assert np.linalg.norm(found[1].pose[:3, 3] - (0.1, 0.35, 0.1)) < 0.015
+    (green,) = found_in(parts, ObstacleSettings(hue=120.0, hue_width=25.0))
+    assert np.linalg.norm(green.pose[:3, 3] - (0.1, -0.35, 0.2)) < 0.015
+
+
+def test_a_bar_before_an_obstacle_does_not_divide_it() -> None:
+    solid, pose, size = CASES["lying box"]
+    bar = solid_part(coal.Box(0.02, 0.02, 0.6), placed(0.55, 0.1, 0.45), 6, GRAY)
+    found = found_in([solid_part(solid, pose, 5, RED), bar])
+    assert len(found) == 1
+    assert np.linalg.norm(found[0].pose[:3, 3] - pose[:3, 3]) < 0.02
+    np.testing.assert_allclose(np.sort(found[0].size), np.sort(size), atol=0.03)
+
+
+def test_what_the_image_cuts_and_what_is_too_large_or_elsewhere() -> None:
+    (cut,) = found_in([solid_part(coal.Box(0.2, 0.2, 0.2), placed(0.3, 0.5, 0.3), 5, RED)])
+    assert cut.cut
+    assert found_in([solid_part(coal.Box(0.02, 1.5, 0.8), placed(0.0, 0.0, 0.4), 5, RED)]) == ()
+    solid, pose, _ = CASES["cube"]
+    assert found_in([solid_part(solid, pose, 5, RED)], ObstacleSettings(high=(0.2, 1.0, 1.0))) == ()
+    assert found_in([]) == ()
+
+
+def test_an_obstacle_s_margins_are_its_deviations() -> None:
+    solid, pose, _ = CASES["cube"]
+    (found,) = found_in([solid_part(solid, pose, 5, RED)])
+    exact, wide = found.obstacle("red"), found.obstacle("red", 2.0)
+    assert exact.box is not None
+    assert wide.box is not None
+    np.testing.assert_allclose(exact.box, found.size)
+    own = found.pose[:3, :3].T @ found.covariance[3:6, 3:6] @ found.pose[:3, :3]
+    ends = np.sqrt(np.diag(own) + np.diag(found.covariance[6:, 6:]) / 4.0)
+    np.testing.assert_allclose(np.array(wide.box) - exact.box, 4.0 * ends)
+    np.testing.assert_allclose(exact.pose, found.pose, atol=1e-9)
+
+
+def test_hues_are_those_of_colorsys() -> None:
+    rng = np.random.default_rng(3)
+    image = rng.integers(0, 256, (40, 50, 3), np.uint8)
+    for hue in (0.0, 100.0, 350.0):
+        settings = ObstacleSettings(hue=hue, hue_width=20.0)
+        mask = ObstacleFinder(settings).colored(image)
+        for row, column in rng.integers(0, (40, 50), (200, 2)):
+            h, s, v = colorsys.rgb_to_hsv(*(image[row, column] / 255.0))
+            apart = abs((360.0 * h - hue + 180.0) % 360.0 - 180.0)
+            margins = np.array([20.0 - apart, 100.0 * (s - settings.saturation), 100.0 * (v - settings.value)])
+            if np.abs(margins).min() > 3.0:  # steps of 8 bits
+                assert mask[row, column] == (margins > 0.0).all()
+
+
+@pytest.mark.parametrize("fields", [{"hue": 400.0}, {"hue_width": 0.0}, {"largest": -1.0}, {"high": (0.0, -2.0, 0.0)}])
+def test_bad_settings_are_refused(fields: dict[str, float]) -> None:
+    with pytest.raises(ParameterError):
+        ObstacleSettings(**fields)  # type: ignore[arg-type]
