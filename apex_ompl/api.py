@@ -23,7 +23,8 @@ from apex_ompl.util.forking import unforked
 
 if TYPE_CHECKING:
     from apex_ompl.constraints.user import UserConstraint
-    from apex_ompl.loop.environment import Environment
+    from apex_ompl.drivers.driver import Driver
+    from apex_ompl.loop.environment import Environment, LiveSensor
     from apex_ompl.loop.result import RunResult
     from apex_ompl.loop.sensor import Sensor
     from apex_ompl.moving.replanner import Replanner
@@ -180,7 +181,9 @@ def run(
     seed: int = 0,
     speed: float = 1.0,
     settings: LoopSettings | None = None,
-    sensor: Sensor | None = None,
+    sensor: Sensor | LiveSensor | None = None,
+    driver: Driver | str | None = None,
+    tolerance: float = 0.05,
 ) -> RunResult:
     """Let a robot go to a goal while obstacles move.
 
@@ -198,8 +201,14 @@ def run(
         seed: Seed of random choices, and of the sensor where none is given.
         speed: Share of the velocity limits that motions use, 0.001 to 1.
         settings: Parameters of the loop; ``prediction`` counts instead of theirs. Their largest error and speed are by
-            default those of the sensor and the environment.
-        sensor: How obstacles are observed.
+            default those of the modeled sensor and the environment; for a sensor of your own they are required.
+        sensor: How obstacles are observed: the model of a sensor, or one of your own, an object with ``read(now)``
+            (:class:`apex_ompl.loop.environment.LiveSensor`).
+        driver: The robot, at rest at the start (:class:`apex_ompl.drivers.driver.Driver`), or a name: ``mujoco``, one
+            in physics, or ``kinematic``. With ``clock="sim"`` its clock is advanced. By default the robot is exactly
+            where it is commanded to be, and a step decides what it does at once, not from the next step on.
+        tolerance: Largest distance of a measured joint from where it should be, beyond which the robot stops and the
+            run ends [rad].
 
     Raises:
         ApexError: The world, the problem, a name or a number is unknown or faulty.
@@ -208,7 +217,7 @@ def run(
 
     return run_in(
         load_environment(problem), method, clock=clock, prediction=prediction, seed=seed, speed=speed,
-        settings=settings, sensor=sensor,
+        settings=settings, sensor=sensor, driver=driver, tolerance=tolerance,
     )  # fmt: skip
 
 

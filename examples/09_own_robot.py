@@ -1,39 +1,47 @@
-"""A camera and a robot of your own in the closed loop, by the wall clock: a ball goes up and down before the robot.
-
-Usage: python examples/09_own_robot.py
-"""
+"""A camera and a robot of your own in the closed loop, by the wall clock: a ball goes up and down before the robot."""
 
 import time
 
-from apex_ompl import Loop, LoopSettings, Obstacle, load_problem
-from apex_ompl.loop import Command
+from apex_ompl import ApexError, LoopSettings, Obstacle, load_problem, load_robot, run
+from apex_ompl.drivers import DriverState
+from apex_ompl.loop import Observation
 
 
-def look(now: float) -> list[Obstacle]:
-    """Return what the camera sees."""
-    height = 0.6 + 0.5 * abs(0.4 * now % 2.0 - 1.0)  # at 0.2 m/s
-    return [Obstacle(name="ball", sphere={"radius": 0.05}, position=(0.5, 0.0, height))]
+class Camera:
+    """Sees a ball that moves at 0.2 m/s."""
+
+    def read(self, now: float) -> Observation:
+        """Return what it sees, once in each period; None where there is nothing new."""
+        ball = Obstacle(name="ball", sphere={"radius": 0.05}, position=(0.5, 0, 0.6 + 0.5 * abs(0.4 * now % 2 - 1)))
+        return Observation(now, now, (ball,), errors={"ball": 0.01})
 
 
 class Robot:
-    """Follows the last command that came in time, to its end at rest."""
+    """Follows each motion from its time on, to its end at rest."""
 
-    command: Command | None = None
+    time, end, fault = property(lambda self: time.monotonic()), 0.0, ""  # end of the last motion; why it stopped
 
-    def state(self, now: float):
-        """Return the measured positions of the joints; None before the first command."""
-        return self.command and self.command.motion(min(max(now - self.command.at, 0.0), self.command.motion.duration))
+    def __init__(self, model, start):
+        """Rest at a state."""
+        self.names, self.limits, self.start, self.sent = model.joint_names, model.limits, start, []
+
+    def state(self) -> DriverState:
+        """Return the measured state: here it is where it should be."""
+        now = self.time
+        for at, motion in self.sent[::-1]:
+            if at <= now:
+                return DriverState(now, motion(now - at), motion(now - at, 1))
+        return DriverState(now, self.start, 0.0 * self.start)
+
+    def send(self, motion, at: float) -> None:
+        """Take a motion in place of what would be done from a time on."""
+        if at < self.time:
+            raise ApexError("the motion comes too late")
+        self.sent.append((at, motion))
+        self.end = at + motion.duration
 
 
-with Loop(load_problem("vertical/free/800001"), settings=LoopSettings(error=0.01, fastest=0.3)) as loop:
-    robot = Robot()
-    while loop.outcome is None:
-        now = time.monotonic()
-        loop.observe(now, look(now))
-        command = loop.step(now, robot.state(now))
-        if command is not None and time.monotonic() < command.at:
-            robot.command = command
-        elif command is not None:
-            loop.missed()
-        time.sleep(0.002)
-    print(loop.outcome, loop.reason, f"{now - loop.events[0].time:.2f} s")
+problem, settings = load_problem("vertical/free/800001"), LoopSettings(error=0.01, fastest=0.3, period=0.025)
+model = load_robot(problem.robot)
+robot = Robot(model, problem.start_state(model.joint_names))
+print(run(problem, clock="real", sensor=Camera(), driver=robot, settings=settings))

@@ -102,6 +102,11 @@ class ScriptedEnvironment(DynamicEnvironment):
         self._obstacles = obstacles
         self._now = 0.0
 
+    @property
+    def still(self) -> bool:
+        """Whether nothing moves or appears."""
+        return not self._obstacles
+
     def start(self, motion: Trajectory, time: float) -> None:
         """Take the first motion, and when it starts [s].
 

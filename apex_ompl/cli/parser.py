@@ -116,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_pictures(commands)
     _add_view(commands)
     _add_convert(commands)
+    _add_calibrate(commands)
     _add_benchmark(commands)
     _add_check(commands)
     for name, text in (
@@ -230,9 +231,9 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
         "problem",
     )  # fmt: skip
     parser.add_argument(
-        "--driver", default="kinematic", help="kinematic, or mujoco: the whole task of a problem whose obstacles stand "
-        "still, in physics, to which of these options --seed, --timeout, --out, --film and --json apply "
-        "(default: %(default)s)",
+        "--driver", metavar="NAME", help="the robot that is driven: mujoco, in physics, or kinematic, an exact one. "
+        "With mujoco a problem whose obstacles stand still is executed to the end of its task, to which of these "
+        "options --seed, --timeout, --out, --film and --json apply",
     )  # fmt: skip
     parser.add_argument("--film", type=Path, metavar="FILE", help="write a film of a task in physics: .mp4")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the run: .npz or .json")
@@ -286,6 +287,22 @@ def _add_convert(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--joint", action="append", default=[], metavar="THEIRS=OURS", help="a joint by another name")
     parser.add_argument("--frame", action="append", default=[], metavar="THEIRS=OURS", help="a frame by another name")
     parser.set_defaults(run="commands:convert")
+
+
+def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("calibrate", help="find where a camera is, by frames of a board in many states")
+    parser.add_argument("frames", type=Path, help="folder of frames with color and joint positions")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="camera file to write (.yaml)")
+    parser.add_argument(
+        "--board", default="charuco:9x6:0.025", metavar="BOARD", help="KIND:COLUMNSxROWS:SQUARE by inner corners and "
+        "meters, KIND charuco or chessboard, or tag:SIDE (default: %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--board-link", metavar="LINK", help="that carries the board (default: it stands still)")
+    parser.add_argument("--camera-link", metavar="LINK", help="that carries the camera (default: it stands still)")
+    parser.add_argument("--camera", type=Path, metavar="FILE", help="camera file (default: the frames' own)")
+    parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints whose readings may be off")
+    parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
+    parser.set_defaults(run="perception:calibrate")
 
 
 def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:

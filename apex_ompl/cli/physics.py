@@ -5,23 +5,23 @@ from __future__ import annotations
 import argparse
 import json
 
-from apex_ompl import api
 from apex_ompl.errors import ParameterError
 from apex_ompl.physics.film import FILMS, save_film
 from apex_ompl.physics.result import SUFFIXES, UNPLANNED
 from apex_ompl.physics.runner import TaskRunner
+from apex_ompl.scene.problem import Problem
 from apex_ompl.util.files import check_writable, suffix_of
 
 SIZE = (640, 480)  # of films [pixels]
 
 
-def execute(parsed: argparse.Namespace) -> int:
+def execute(problem: Problem, parsed: argparse.Namespace) -> int:
     """Execute the task, write its log and film, print the outcome, and return the exit code."""
     for file, known in ((parsed.out, SUFFIXES), (parsed.film, FILMS)):
         if file is not None:
             suffix_of(file, known)
             check_writable(file)
-    runner = TaskRunner(api.load_problem(parsed.world), timeout=parsed.timeout)
+    runner = TaskRunner(problem, timeout=parsed.timeout)
     result, frames = runner.run(parsed.seed, SIZE if parsed.film is not None else None)
     if parsed.out is not None:
         result.save(parsed.out)

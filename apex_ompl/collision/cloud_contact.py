@@ -26,7 +26,7 @@ from apex_ompl.kernel.geometry import (
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.meshes import triangles
-from apex_ompl.types import Array, Indices
+from apex_ompl.types import Array, Flags, Indices
 from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.validation import check_array, check_number, finite_array
 
@@ -98,6 +98,14 @@ def filter_points(
         UnknownNameError: An unknown link holds an object.
     """
     cloud = finite_array(points, "points")
+    return cloud[~on_robot(cloud, robot, state, margin, held)]
+
+
+def on_robot(
+    points: ArrayLike, robot: Robot, state: ArrayLike, margin: float = 0.02, held: Iterable[AttachedObject] = ()
+) -> Flags:
+    """Return which points :func:`filter_points` leaves out, whose arguments it has, shape (N,)."""
+    cloud = finite_array(points, "points")
     check_array(cloud, (len(cloud), 3) if cloud.ndim else (0, 3), "points")
     q = finite_array(state, "state")
     check_array(q, (robot.dof,), "state")
@@ -106,9 +114,12 @@ def filter_points(
     pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
     items = [(item.geometry, data.oMi[item.parentJoint] * item.placement) for item in robot.geometry.geometryObjects]
     items += [(coal_geometry(one), pin.SE3(robot.link_pose(q, one.link) @ one.pose)) for one in held]
+    left = np.arange(len(cloud))
     for shape, pose in items:
-        cloud = cloud[_distances(cloud, Solid("", 0, pose, shape), pose, margin + NEARLY) > margin]
-    return cloud
+        left = left[_distances(cloud[left], Solid("", 0, pose, shape), pose, margin + NEARLY) > margin]
+    found = np.ones(len(cloud), bool)
+    found[left] = False
+    return found
 
 
 def _distances(points: Array, solid: Solid, pose: pin.SE3, limit: float) -> Array:

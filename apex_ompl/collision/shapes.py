@@ -6,6 +6,7 @@ contacts are found by :mod:`apex_ompl.collision.cloud_contact`.
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import logging
 from contextlib import AbstractContextManager, nullcontext
@@ -150,8 +151,10 @@ def mesh_note(body: Body) -> str:
 def _load(name: str, shape: MeshFile | PointFile | GridFile) -> coal.CollisionGeometry:
     """Return the geometry in a file; files of the same content, read alike, share it."""
     role = f"{'mesh' if isinstance(shape, MeshFile) else 'file'} of {name!r}"
-    content = read_file(Path(shape.file), role)
-    how = f"{type(shape).__name__} {shape.model_dump_json(exclude={'file'})} {Path(shape.file).suffix.lower()}"
+    content = read_file(Path(shape.file), role) if shape.content is None else base64.b64decode(shape.content)
+    how = (
+        f"{type(shape).__name__} {shape.model_dump_json(exclude={'file', 'content'})} {Path(shape.file).suffix.lower()}"
+    )
     key = hashlib.sha256(content + how.encode()).hexdigest()
     with _loading:
         geometry = _meshes.get(key)

@@ -35,6 +35,7 @@ class Driver(Protocol):
     Attributes:
         names: Names of the joints, in the order of states.
         limits: Limits of the joints, which each motion must keep.
+        time: Time on the driver's clock [s].
     """
 
     names: tuple[str, ...]

@@ -58,7 +58,7 @@ class KinematicDriver:
         if fault:
             raise ParameterError("state", fault, "a state within the limits")
         self._clock, self._time, self._closed = clock, 0.0, False
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def __repr__(self) -> str:
         """Return the time, and whether the driver is closed."""
@@ -72,7 +72,8 @@ class KinematicDriver:
     @property
     def end(self) -> float:
         """Time from which on rest is commanded [s]."""
-        return self._commands.end
+        with self._lock:
+            return self._commands.end
 
     def advance(self, until: float) -> None:
         """Let the simulated clock go on to a time [s].
@@ -89,7 +90,8 @@ class KinematicDriver:
     @property
     def fault(self) -> str:
         """Why the driver stopped, in a sentence; else empty."""
-        return self._commands.fault
+        with self._lock:  # so that the stop is commanded where there is a fault
+            return self._commands.fault
 
     def state(self) -> DriverState:
         """Return the commanded state, off by as much as the robot was pushed."""
@@ -146,7 +148,7 @@ class KinematicDriver:
     def _stop(self) -> None:
         self._commands.stop(self.time)
 
-    def _open(self) -> threading.Lock:
+    def _open(self) -> threading.RLock:
         if self._closed:
             raise ParameterError("driver", "one that was closed", "an open one")
         return self._lock

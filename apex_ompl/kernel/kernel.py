@@ -136,6 +136,20 @@ class Kernel:
         in_threads(len(states), threads, place)
         return rotation, origin
 
+    def cover_spheres(self, q: ArrayLike) -> Array:
+        """Return the spheres that contain the robot and its held objects in a state, shape (dof,).
+
+        Returns:
+            Centers in the world and radii, shape (S, 4) [m].
+        """
+        arrays = self.robot.arrays
+        rotation, origin = (frames[0] for frames in self.joint_frames(q))
+        sizes = np.diff(np.append(arrays.body_root, len(arrays.node_count)))
+        leaf = arrays.node_count == 0
+        joint = np.repeat(arrays.body_joint, sizes)[leaf]
+        centers = (rotation[joint] * arrays.node_center[leaf][:, None]).sum(axis=2) + origin[joint]
+        return np.column_stack([centers, arrays.node_radius[leaf]])
+
     def joint_pushes(
         self, frames: tuple[Array, Array], carriers: NDArray[np.int64], points: Array, found: tuple[Array, Array],
         reach: float,

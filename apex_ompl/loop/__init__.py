@@ -8,6 +8,7 @@ from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
     from apex_ompl.loop.environment import Environment as Environment
+    from apex_ompl.loop.environment import LiveSensor as LiveSensor
     from apex_ompl.loop.environment import Observation as Observation
     from apex_ompl.loop.loop import Command as Command
     from apex_ompl.loop.loop import Loop as Loop
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "environment": "Environment Observation",
+        "environment": "Environment LiveSensor Observation",
         "loop": "Command Loop",
         "result": "Event Outcome RunResult",
         "sensor": "Sensor SensorStream",

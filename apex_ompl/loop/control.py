@@ -141,6 +141,10 @@ class Control:
         found = self.tracker.predicted(settings.margin, settings.prediction)
         return self.tracker.ease_margins(found, self.executor.state(now), soon)
 
+    def step(self, now: float) -> RunRecord | None:
+        """Decide what the robot does from a time on [s], and return the record of the run where it is over."""
+        return self.decide(now, self.predicted(now))
+
     def decide(
         self, now: float, predicted: DynamicObstacles, present: Callable[[], tuple[Obstacle, ...]] | None = None
     ) -> RunRecord | None:

@@ -12,6 +12,7 @@ from apex_ompl.loop.tracking import Tracker, true_motions
 from apex_ompl.moving.context import RunContext
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import obstacle_at
+from apex_ompl.types import Array
 
 
 class Cycle(Control):
@@ -37,9 +38,14 @@ class Cycle(Control):
         self._waiting: list[Observation] = []
         self._started, self._broken, self._present_time = False, 0, 0.0
 
-    def advance(self, now: float) -> None:
-        """Advance the environment to a time [s], and collect the observations until then."""
-        self._environment.advance(now, self.executor.state(now))
+    def advance(self, now: float, q: Array | None = None) -> None:
+        """Advance the environment to a time, and collect the observations until then.
+
+        Args:
+            now: The time [s].
+            q: The robot's state then, shape (dof,), by default the one that it should be in.
+        """
+        self._environment.advance(now, self.executor.state(now) if q is None else q)
         if not self.aborted:
             try:
                 self._waiting += self._sensor.observations(now)
@@ -67,7 +73,7 @@ class Cycle(Control):
                 now, predicted, lambda: tuple(obstacle_at(o, now - self._present_time) for o in self._present)
             )
         else:
-            ended = self.decide(now, self.predicted(now))
+            ended = super().step(now)
         return None if ended is None else replace(ended, broken=self._broken)
 
     def announce_start(self, now: float) -> None:
@@ -82,6 +88,6 @@ def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float) -> boo
     """Whether an obstacle violates the assumptions of the guarantee: unseen, or outside its reachable set."""
     for o in present:
         known = [track for track in (*tracker.tracks.values(), *tracker.doubted) if track.shape.name == o.name]
-        if not any(tracker.may_be(track, o, now, errors=1) for track in known):
+        if not any(tracker.may_be(track, o, now) for track in known):
             return True
     return False

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Protocol
+
+from numpy.typing import ArrayLike
 
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
@@ -54,11 +56,17 @@ class Observation:
         received: When the loop receives the observation [s], not before the stamp.
         seen: The obstacles with their shapes where they were seen, by name, without velocities. A known obstacle that
             is missing here was not seen, which tells nothing about where it is.
+        errors: Errors of positions by names of obstacles, in place of the largest error of the settings: a largest
+            distance [m], or a covariance of the position, shape (3, 3) [m^2], of which three standard deviations along
+            its longest axis count.
+        gone: Names of obstacles that are not there any more.
     """
 
     stamp: float
     received: float
     seen: tuple[Obstacle, ...]
+    errors: Mapping[str, ArrayLike] = field(default_factory=dict)
+    gone: tuple[str, ...] = ()
 
     __repr__ = fields_line
 
@@ -68,3 +76,15 @@ class ObservationSource(Protocol):
 
     def observations(self, until: float) -> Iterable[Observation]:
         """Return the observations with stamps up to a time [s] that were not returned before, in order of stamp."""
+
+
+class LiveSensor(Protocol):
+    """A sensor of one's own."""
+
+    def read(self, now: float) -> Observation | None:
+        """Return what it saw since the last call, or None; called once in each period.
+
+        Args:
+            now: Time on the clock of the run [s]: the driver's, or the time since the start of the run. Stamps are of
+                that clock.
+        """

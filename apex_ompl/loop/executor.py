@@ -428,3 +428,8 @@ class Executor:
     def state(self, now: float) -> Array:
         """Return the robot's state, shape (dof,)."""
         return self.following.state(now)
+
+    def state_then(self, time: float) -> Array:
+        """Return the robot's state at a time that may be over, shape (dof,)."""
+        known = (one for start, one in reversed(self.followed) if start <= time + SAME_TIME)
+        return next(known, self.followed[0][1]).state(time)

@@ -35,6 +35,8 @@ from apex_ompl.util.validation import check_number, check_states
 SPACING = 1e-3  # of the samples [s]
 STRETCH = 0.01  # time that is sampled before a proof is tried again [s]
 LIMIT_TOLERANCE = 1e-5  # tolerated share over a limit: rounding of the jerk between knots that are 1 ns apart
+MEASURED_REST = 1e-3  # largest measured velocity of a joint at rest [rad/s]
+NEAR_GOAL = 0.02  # largest distance of a measured joint from the goal [rad; synergies 0..1]
 NEAR = 1e-3  # largest clearance of spheres that is computed [m]
 
 
@@ -125,6 +127,7 @@ class RefereeReport:
 def judge(
     robot: Robot, problem: Problem, trajectory: Trajectory, *, end: float | None = None,
     goals: ArrayLike | None = None, limits: Limits | None = None, dynamic: Iterable[str] = (),
+    commanded: Trajectory | None = None,
 ) -> RefereeReport:  # fmt: skip
     """Judge the executed motion of a run by the true motions of the obstacles.
 
@@ -136,6 +139,8 @@ def judge(
         goals: States of which the motion is to end in one, shape (N, dof); by default the goal of the problem.
         limits: Limits that are to be kept, by default the robot's.
         dynamic: Names of obstacles that count as moving, though they were at rest all the time.
+        commanded: What was commanded, where ``trajectory`` was measured. Then limits and the rest at the goal are those
+            of the command, near whose end the measured motion ends, and a robot is at rest below ``MEASURED_REST``.
 
     Raises:
         ParameterError: The motion is one of other joints, ``end`` is before its end, or the goals have another shape.
@@ -155,26 +160,38 @@ def judge(
     times = np.append(SPACING * np.arange(np.ceil(until / SPACING - 1e-9)), until)
     clearances = scripted.clearances(trajectory, times)
     least = int(np.nanargmin(clearances)) if not np.isnan(clearances).all() else 0
-    speeds, rates = np.abs(trajectory.velocities[-1]), np.abs(trajectory.accelerations[-1])
-    contact, moving_contact = ExactDynamicObstacles(robot, problem, scripted).first_contacts(trajectory, times)
+    wanted, rest = (trajectory, AT_REST) if commanded is None else (commanded, MEASURED_REST)
+    speeds, rates = np.abs(wanted.velocities[-1]), np.abs(wanted.accelerations[-1])
+    off = float(np.abs(trajectory.positions[-1] - wanted.positions[-1]).max())
+    exact = ExactDynamicObstacles(robot, problem, scripted, rest)
+    contact, moving_contact = exact.first_contacts(trajectory, times)
     return RefereeReport(
         contact=contact,
         moving_contact=moving_contact,
-        still_contact=still_contact(checker, trajectory, times),
-        limit_use=trajectory.use(limits or robot.limits),
+        still_contact=still_contact(checker, trajectory, times, rest),
+        limit_use=wanted.use(limits or robot.limits),
         clearance=float(clearances[least]),
         clearance_time=float(times[least]) if np.isfinite(clearances[least]) else np.nan,
         at_rest=bool((speeds <= AT_REST).all() and (rates <= AT_REST).all()),
-        at_goal=is_at_goal(robot, problem, trajectory.positions[-1], goals),
+        at_goal=off <= NEAR_GOAL and is_at_goal(robot, problem, wanted.positions[-1], goals),
     )
 
 
 class ExactDynamicObstacles:
     """Exact shapes of a robot, its held objects and dynamic obstacles."""
 
-    def __init__(self, robot: Robot, problem: Problem, scripted: ScriptedDynamicObstacles) -> None:
-        """Take the robot, the problem with its held objects and allowed pairs, and the obstacles."""
-        self._robot, self._scripted = robot, scripted
+    def __init__(
+        self, robot: Robot, problem: Problem, scripted: ScriptedDynamicObstacles, rest: float = AT_REST
+    ) -> None:  # fmt: skip
+        """Take the robot, the problem with its held objects and allowed pairs, the obstacles, and a speed of rest.
+
+        Args:
+            robot: The robot.
+            problem: The problem.
+            scripted: The obstacles.
+            rest: Largest velocity of a joint at rest [rad/s].
+        """
+        self._robot, self._scripted, self._rest = robot, scripted, rest
         self._obstacles: dict[str, Obstacle] = {o.name: o for o in scripted.obstacles}
         bodies = SceneBodies(robot)
         bodies.fill(scripted.obstacles, problem.attached, fixtures=False)
@@ -195,7 +212,7 @@ class ExactDynamicObstacles:
         """
         first = None
         for time, there in self._near(motion, times):
-            if first is not None and is_at_rest(motion, time):
+            if first is not None and is_at_rest(motion, time, self._rest):
                 continue
             found = self.contact_at(motion, time, there)
             first = found if first is None else first
@@ -235,7 +252,8 @@ class ExactDynamicObstacles:
         deepest = next((c for c in self._meshes.contacts(order) if c.second in there), None)
         if deepest is None:
             return None
-        return RunContact(time, deepest.first, deepest.second, deepest.depth, not is_at_rest(motion, time))
+        moved = not is_at_rest(motion, time, self._rest)
+        return RunContact(time, deepest.first, deepest.second, deepest.depth, moved)
 
     def _among(self, motion: Trajectory, times: Array, piece: Piece) -> Iterator[tuple[float, tuple[str, ...]]]:
         """Yield the times of a piece at which the sphere covers do not prove the robot clear."""
@@ -245,7 +263,9 @@ class ExactDynamicObstacles:
             yield from ((time, there) for time in times[~(spheres > 0.0)].tolist())
 
 
-def still_contact(checker: CollisionChecker, motion: Trajectory, times: Array) -> RunContact | None:
+def still_contact(
+    checker: CollisionChecker, motion: Trajectory, times: Array, rest: float = AT_REST
+) -> RunContact | None:
     """Return the first contact of a motion with the scene of a checker or of the robot with itself, or None.
 
     The motion is checked continuously along its cubic pieces; the first sample in contact is sought where that fails.
@@ -254,6 +274,7 @@ def still_contact(checker: CollisionChecker, motion: Trajectory, times: Array) -
         checker: The robot among static obstacles.
         motion: The motion.
         times: Times of the samples, shape (N,), increasing [s].
+        rest: Largest velocity of a joint at rest [rad/s].
     """
     curve = Curve.cubic(motion.times, motion.positions, motion.velocities, motion.accelerations)
     proof = checker.prove(curve, tolerance=0.0)
@@ -265,7 +286,7 @@ def still_contact(checker: CollisionChecker, motion: Trajectory, times: Array) -
     q = motion(time)
     contacts = checker.contacts(q) if np.isfinite(checker.robot.to_pinocchio(q)).all() else []
     names, depth = ((contacts[0].first, contacts[0].second), contacts[0].depth) if contacts else (proof.pair, 0.0)
-    return RunContact(time, *names, depth, not is_at_rest(motion, time))
+    return RunContact(time, *names, depth, not is_at_rest(motion, time, rest))
 
 
 def is_at_goal(robot: Robot, problem: Problem, q: Array, goals: ArrayLike | None = None) -> bool:

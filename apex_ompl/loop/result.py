@@ -32,7 +32,7 @@ INTERRUPTED = "interrupted"  # reason of a run that the user ended
 JSON_NAMES = {"str": "text", "list": "list", "dict": "mapping"}
 SHOWN = {
     "time_to_goal": ("s", 1.0), "rest_time": ("s", 1.0), "clearance": ("mm", 1e3), "reaction_p95": ("ms", 1e3),
-    "tick_p99": ("ms", 1e3), "deadline_misses": ("", 1.0),
+    "tick_p99": ("ms", 1e3), "deadline_misses": ("", 1.0), "tracking_error": ("mrad", 1e3), "late_commands": ("", 1.0),
 }  # fmt: skip
 COUNTS = ("replans_asked", "replans_accepted", "conflicts", "stops", "unguarded_steps", "broken_steps")
 
@@ -62,7 +62,7 @@ class Event:
     Attributes:
         time: When [s].
         kind: ``observation refused``, ``place doubted``, ``blind``, ``conflict``, ``stop``, ``request``, ``accepted``,
-            ``rejected``, ``reaction``, ``goal``, ``broken assumption`` or ``contact``.
+            ``rejected``, ``reaction``, ``goal``, ``broken assumption``, ``driver fault`` or ``contact``.
         data: Details, as JSON: texts and numbers.
     """
 

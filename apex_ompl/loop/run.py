@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.drivers.driver import Driver
+from apex_ompl.drivers.kinematic import KinematicDriver
+from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import ParameterError
-from apex_ompl.loop.clocks import cores, run_in_real_time, simulate
+from apex_ompl.loop.clocks import cores, run_in_real_time, simulate, undisturbed, warm_up
 from apex_ompl.loop.control import RunRecord
-from apex_ompl.loop.environment import Environment
+from apex_ompl.loop.cycle import Cycle
+from apex_ompl.loop.driven import DrivenRun, LiveStream, check_driver
+from apex_ompl.loop.environment import Environment, LiveSensor, ObservationSource
+from apex_ompl.loop.loop import TOLERANCE
 from apex_ompl.loop.metrics import run_metrics
 from apex_ompl.loop.preparation import context_of, work_of
 from apex_ompl.loop.referee import judge
 from apex_ompl.loop.replan.methods import method_of
-from apex_ompl.loop.replanning import PlannerProcess
+from apex_ompl.loop.replanning import ImmediateReplanning, PlannerProcess, Replanning
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.compute_costs import cost_table
@@ -25,18 +33,21 @@ from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import Replanner
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.model import Robot, digest
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Trajectory
-from apex_ompl.util.validation import check_name, check_seed
+from apex_ompl.util.validation import check_name, check_number, check_seed
 
-CLOCKS = ("sim", "real")
+DRIVERS = ("kinematic", "mujoco")
+"""Names of drivers that can be made for a problem."""
+CLOCKS = SIMULATED, REAL = "sim", "real"
 
 
 def run_in(
     environment: Environment, method: str | Replanner = "apex", *, clock: str = "sim", prediction: str = "cv",
-    seed: int = 0, speed: float = 1.0, settings: LoopSettings | None = None, sensor: Sensor | None = None,
+    seed: int = 0, speed: float = 1.0, settings: LoopSettings | None = None,
+    sensor: Sensor | LiveSensor | None = None, driver: Driver | str | None = None, tolerance: float = TOLERANCE,
 ) -> RunResult:  # fmt: skip
     """Let a robot go to a goal in an environment whose obstacles move; see :func:`apex_ompl.run` for the arguments.
 
@@ -44,6 +55,8 @@ def run_in(
         ApexError: The environment was used before, or the problem, a name or a number is unknown or faulty.
     """
     check_name(clock, "clock", CLOCKS)
+    if isinstance(driver, str):
+        check_name(driver, "driver", DRIVERS)
     check_seed(seed)
     if settings is not None and not isinstance(settings, LoopSettings):
         raise ParameterError("settings", settings, "a LoopSettings")
@@ -51,14 +64,18 @@ def run_in(
     if environment.ran:
         raise ParameterError("problem", environment.name, "an environment without a run so far: load it again")
     sensor = sensor or Sensor(seed=seed)
-    settings = (settings or LoopSettings()).completed(sensor.largest_error, environment.fastest)
+    settings = _completed(settings or LoopSettings(), sensor, environment)
+    check_number(tolerance, "tolerance", 0.0, np.pi)
     used = replace(replace(settings, prediction=prediction), **replanning.settings)
     environment.ran = True
     with quiet_ompl():
         seed_ompl(seed)
         context = context_of(environment.problem, used, speed, seed)
         setup = context.setup
-        noted = {"loop": asdict(used), "sensor": asdict(sensor), "speed": speed, "costs": cost_table()["version"]}
+        if driver is not None and not isinstance(driver, str):
+            check_driver(driver, setup.robot, simulated=clock == SIMULATED)
+        noted = {"loop": asdict(used), "sensor": _noted(sensor), "speed": speed, "costs": cost_table()["version"]}
+        noted |= {} if driver is None else {"driver": driver if isinstance(driver, str) else type(driver).__name__}
         run = _Run(environment, context, replanning.name, clock, seed, noted)
         fault = setup.start_fault
         if fault or not len(context.goals):
@@ -67,15 +84,76 @@ def run_in(
             outcome = Outcome.START_INVALID if fault else Outcome.STUCK
             done = RunRecord(motion, (), False, fault or "; ".join(setup.goal_faults), 0)
             return run.result(done, outcome, done.ended)
-        stream = SensorStream(sensor, environment, used.watched)
-        if clock == "real":
-            with PlannerProcess(work_of(context, method, seed), cores()[1]) as process:
+        with ExitStack() as stack:
+            if clock == SIMULATED:
+                replanner = replanning.make()
+                replanner.prepare(context)
+            else:
+                process = stack.enter_context(PlannerProcess(work_of(context, method, seed), cores()[1]))
+            if driver is not None:
+                if isinstance(driver, str):
+                    driver = stack.enter_context(closing(named_driver(driver, environment.problem, setup.robot, clock)))
+                answers = ImmediateReplanning(context, replanner) if clock == SIMULATED else process
+                return run.driven(driver, answers, sensor, tolerance)
+            stream = stream_of(sensor, environment, used.watched)
+            if clock == SIMULATED:
+                done = simulate(environment, context, replanner, stream, seed)
+            else:
                 done = run_in_real_time(environment, context, process, stream, seed)
-        else:
-            replanner = replanning.make()
-            replanner.prepare(context)
-            done = simulate(environment, context, replanner, stream, seed)
     return run.judged(done)
+
+
+def _completed(settings: LoopSettings, sensor: Sensor | LiveSensor, environment: Environment) -> LoopSettings:
+    """Return the settings with a largest error and a largest speed of obstacles.
+
+    Raises:
+        ParameterError: They have none, and the sensor is the caller's.
+    """
+    if isinstance(sensor, Sensor):
+        return settings.completed(sensor.largest_error, environment.fastest)
+    if not callable(getattr(sensor, "read", None)):
+        raise ParameterError("sensor", sensor, "a Sensor, or an object with read(now)")
+    missing = [name for name in ("error", "fastest") if getattr(settings, name) is None]
+    if missing:
+        raise ParameterError("settings", f"no {' and no '.join(missing)}", "both, for a sensor of one's own")
+    return settings
+
+
+def named_driver(name: str, problem: Problem, robot: Robot, clock: str) -> Driver:
+    """Return a driver at the start of a problem: ``kinematic`` or ``mujoco``.
+
+    Obstacles that move are not in its physics: the referee finds what the robot touches.
+
+    Raises:
+        UnknownNameError: There is none of that name.
+        ParameterError: Physics on the wall clock.
+        MissingFileError: The extra ``twin`` is not installed.
+    """
+    start = problem.start_state(robot.joint_names)
+    if check_name(name, "driver", DRIVERS) == "kinematic":
+        return KinematicDriver(robot, start, clock=None if clock == SIMULATED else time.monotonic)
+    if clock != SIMULATED:
+        raise ParameterError("driver", name, "the simulated clock, on which physics is")
+    return MujocoDriver(robot, problem.still, state=start)
+
+
+def _noted(sensor: Sensor | LiveSensor) -> dict[str, Any]:
+    """Return what a result says of a sensor."""
+    return asdict(sensor) if isinstance(sensor, Sensor) else {"name": type(sensor).__name__}
+
+
+def stream_of(
+    sensor: Sensor | LiveSensor, environment: Environment, watched: float, zero: float = 0.0
+) -> ObservationSource:
+    """Return a sensor at work.
+
+    Args:
+        sensor: The sensor.
+        environment: What a modeled one observes.
+        watched: How long it observed before the run [s].
+        zero: Time at which the run starts on the clock of a sensor of the caller [s].
+    """
+    return SensorStream(sensor, environment, watched) if isinstance(sensor, Sensor) else LiveStream(sensor, zero)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,11 +179,25 @@ class _Run:
             robot_digest=digest(robot),
         )  # fmt: skip
 
-    def judged(self, done: RunRecord) -> RunResult:
-        """Return the result with the referee's report."""
+    def driven(self, driver: Driver, answers: Replanning, sensor: Sensor | LiveSensor, tolerance: float) -> RunResult:
+        """Run on a driver's clock, and return the result."""
+        context, simulated = self.context, self.clock == SIMULATED
+        with nullcontext() if simulated else undisturbed(cores()[0]):
+            if not simulated:
+                warm_up(context, tuple(self.environment.present(0.0)), self.seed)
+            zero = driver.time
+            stream = stream_of(sensor, self.environment, context.settings.watched, zero)
+            cycle = Cycle(self.environment, context, answers, stream, self.seed, lead=context.settings.period)
+            run = DrivenRun(cycle, driver, zero, simulated, tolerance)
+            done = run.run()
+        return self.judged(done, run.executed())
+
+    def judged(self, done: RunRecord, measured: Trajectory | None = None) -> RunResult:
+        """Return the result with the referee's report, on the measured motion where there is one."""
         dynamic = [o.name for o in self.environment.script()]
         report = judge(
-            self.context.setup.robot, self.problem(), done.trajectory, goals=self.context.goals, dynamic=dynamic
+            self.context.setup.robot, self.problem(), done.trajectory if measured is None else measured,
+            goals=self.context.goals, dynamic=dynamic, commanded=None if measured is None else done.trajectory,
         )  # fmt: skip
         outcome, reason = report.outcome, "; ".join(report.faults)
         if outcome is None:

@@ -7,15 +7,16 @@ Each obstacle has a filter of its own whose state is position and velocity, with
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.kernel import Kernel
 from apex_ompl.loop.environment import Observation
+from apex_ompl.loop.sensor import CUT
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
 from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.types import Array
@@ -26,6 +27,7 @@ MOST_DOUBTED = 8  # contradicting places of one obstacle that are all kept
 GAP = 0.1  # longest time between two observations that counts as observed [s]
 GATE = 16.0  # squared Mahalanobis distance, of three axes, after which an obstacle has turned
 AXES = 3
+ASYMMETRY = 1e-6  # of a covariance that counts as rounding, as a share of its largest entry
 LEAST = 0.002  # clearance beyond the margins that a robot has where it is at rest [m]
 
 
@@ -62,7 +64,8 @@ class Track:
         covariance: Covariance of position and velocity on each axis, shape (2, 2).
         seen: Number of observations since it was new or turned.
         unseen: Time for which the sensor looked and did not see it since the last observation [s].
-        looks: Observed positions with its shape of now, the oldest first, rows of a stamp [s] and a position [m].
+        looks: Observed positions with its shape of now, the oldest first, rows of a stamp [s], a position [m], and its
+            largest error, NaN for that of the settings [m].
     """
 
     shape: Obstacle
@@ -72,18 +75,25 @@ class Track:
     covariance: Array
     seen: int = 1
     unseen: float = 0.0
-    looks: list[tuple[float, float, float, float]] = field(default_factory=list)
+    looks: list[tuple[float, float, float, float, float]] = field(default_factory=list)
 
     @classmethod
-    def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings) -> Track:
-        """Start with an observation."""
-        spread = np.diag([settings.noise**2, settings.speed**2])
-        looks = [(stamp, *seen.position)]
+    def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings, error: float = math.nan) -> Track:
+        """Start with an observation, whose largest error is NaN for that of the settings [m]."""
+        spread = np.diag([_noise(settings, error) ** 2, settings.speed**2])
+        looks = [(stamp, *seen.position, error)]
         return cls(seen, stamp, np.array(seen.position, float), np.zeros(AXES), spread, looks=looks)
 
-    def update(self, seen: Obstacle, stamp: float, settings: TrackSettings) -> bool:
-        """Take a later observation; return False where the obstacle has turned, and the filter is reset."""
-        dt, noise = stamp - self.stamp, settings.noise**2 + 1e-12
+    def update(self, seen: Obstacle, stamp: float, settings: TrackSettings, error: float = math.nan) -> bool:
+        """Take a later observation; return False where the obstacle has turned, and the filter is reset.
+
+        Args:
+            seen: The obstacle.
+            stamp: When it was there [s].
+            settings: Parameters of the filter.
+            error: Largest error of the position, NaN for that of the settings [m].
+        """
+        dt, noise = stamp - self.stamp, _noise(settings, error) ** 2 + 1e-12
         forward = np.array([[1.0, dt], [0.0, 1.0]])
         drift = settings.power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
         expected = forward @ self.covariance @ forward.T + drift
@@ -92,9 +102,9 @@ class Track:
         before = (
             self.looks[1 - LOOKS :] if same_solid(seen, self.shape) else []
         )  # a position of another shape does not bound this one
-        self.shape, self.stamp, self.unseen, self.looks = seen, stamp, 0.0, [*before, (stamp, *seen.position)]
+        self.shape, self.stamp, self.unseen, self.looks = seen, stamp, 0.0, [*before, (stamp, *seen.position, error)]
         if miss @ miss > GATE * spread:
-            fresh = Track.new(seen, stamp, settings)
+            fresh = Track.new(seen, stamp, settings, error)
             self.place, self.velocity, self.covariance, self.seen = fresh.place, fresh.velocity, fresh.covariance, 1
             return False
         gain = expected[:, 0] / spread
@@ -108,6 +118,35 @@ class Track:
         """Return the margin of the obstacle at the stamp [m], and its growth after that [m/s]."""
         place, speed = (math.sqrt(max(v, 0.0)) for v in np.diag(self.covariance))
         return settings.widths * place, min(settings.speed_widths * speed, settings.most)
+
+
+def _noise(settings: TrackSettings, error: float) -> float:
+    """Return the standard deviation of an observed position on each axis [m]."""
+    return settings.noise if math.isnan(error) else error / CUT
+
+
+def error_fault(error: Any) -> str:
+    """Return why an error of an observation is none (:class:`apex_ompl.loop.environment.Observation`), or nothing."""
+    try:
+        given = np.asarray(error, float)
+    except (TypeError, ValueError):
+        return "is no number and no matrix"
+    if given.shape not in ((), (3, 3)):
+        return f"has the shape {given.shape}"
+    if not np.isfinite(given).all():
+        return "is not finite"
+    if given.ndim == 0:
+        return "" if given >= 0.0 else "is negative"
+    rounding = ASYMMETRY * np.abs(given).max()
+    if np.abs(given - given.T).max() > rounding or np.linalg.eigvalsh(given)[0] < -rounding:
+        return "is not symmetric and positive semidefinite"
+    return ""
+
+
+def largest_error(error: ArrayLike) -> float:
+    """Return the largest error of a position [m]: of a covariance, three standard deviations along its longest axis."""
+    given = np.asarray(error, float)
+    return float(given) if given.ndim == 0 else CUT * math.sqrt(max(float(np.linalg.eigvalsh(given)[-1]), 0.0))
 
 
 class Taken(NamedTuple):
@@ -173,12 +212,15 @@ class Tracker:
         self.last = max(self.last, stamp)
         for seen in observation.seen:
             self.awaited.discard(seen.name)
-            track = self.tracks.get(seen.name)
+            track, error = self.tracks.get(seen.name), math.nan
+            if seen.name in observation.errors:
+                error = largest_error(observation.errors[seen.name])
             if track is None:
-                self.tracks[seen.name] = Track.new(seen, stamp, self.settings)
-            elif stamp > track.stamp and not self._take_place(track, seen, stamp):
+                self.tracks[seen.name] = Track.new(seen, stamp, self.settings, error)
+            elif stamp > track.stamp and not self._take_place(track, seen, stamp, error):
                 way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
                 found.append(f"{seen.name} was {way:.3g} m away {stamp - track.stamp:.3g} s before")
+        self._remove(observation.gone, stamp)
         self._forget({seen.name for seen in observation.seen}, watched)
         return Taken(doubted=tuple(found))
 
@@ -194,48 +236,65 @@ class Tracker:
                 return f"the place of {seen.name} is not finite"
             if seen.half_space is not None:
                 return f"{seen.name} has no bounds"
+        for name, error in observation.errors.items():
+            fault = error_fault(error) if name in (*names, *observation.gone) else "has no obstacle"
+            if fault:
+                return f"the error of {name} {fault}"
         if len({*names}) < len(names):
             return "it has a name twice"
         if len({*names, *self.tracks}) > MOST_TRACKS:
             return f"there are more than {MOST_TRACKS} obstacles"
         return ""
 
-    def _take_place(self, track: Track, seen: Obstacle, stamp: float) -> bool:
-        """Take a later place of an obstacle; return whether it agrees with earlier ones."""
+    def _take_place(self, track: Track, seen: Obstacle, stamp: float, error: float) -> bool:
+        """Take a later place of an obstacle, with its error [m]; return whether it agrees with earlier ones."""
         others = [one for one in self.doubted if one.shape.name == seen.name]
-        known = next((one for one in (track, *others) if self.may_be(one, seen, stamp)), None)
+        own = self.error if math.isnan(error) else error
+        known = next((one for one in (track, *others) if self.may_be(one, seen, stamp, own)), None)
         if known is not None:
-            known.update(seen, stamp, self.settings)
+            known.update(seen, stamp, self.settings, error)
             self.tracks[seen.name] = known
             self.doubted = [one for one in self.doubted if one.shape.name != seen.name]
             return True
         kept = [*others, track]
         del kept[1 : 1 + max(len(kept) - MOST_DOUBTED, 0)]  # the oldest and the newest ones stay
         self.doubted = [one for one in self.doubted if one.shape.name != seen.name] + kept
-        self.tracks[seen.name] = Track.new(seen, stamp, self.settings)
+        self.tracks[seen.name] = Track.new(seen, stamp, self.settings, error)
         return False
 
-    def may_be(self, track: Track, seen: Obstacle, stamp: float, errors: int = 2) -> bool:
+    def may_be(self, track: Track, seen: Obstacle, stamp: float, error: float = 0.0) -> bool:
         """Whether an obstacle can have moved from the place of a track to where it is seen at a later time [s].
 
         Args:
             track: The track.
             seen: The obstacle.
             stamp: The time [s].
-            errors: How many of the two places are observed, with an error.
+            error: Largest error of the later place [m].
         """
         way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
-        return way <= errors * self.error + self.fastest * (stamp - track.stamp) + 1e-9
+        own = track.looks[-1][-1]
+        before = self.error if math.isnan(own) else own
+        return way <= before + error + self.fastest * (stamp - track.stamp) + 1e-9
+
+    def _remove(self, names: Collection[str], stamp: float) -> None:
+        """Remove obstacles that are not there any more at a time [s]."""
+        for name in names:
+            self.awaited.discard(name)
+            if name in self.tracks and self.tracks[name].stamp < stamp:
+                del self.tracks[name]
+                self.doubted = [track for track in self.doubted if track.shape.name != name]
 
     def _forget(self, seen: set[str], watched: float) -> None:
-        """Forget obstacles that were not seen for ``memory``.
+        """Forget obstacles that were not seen for ``memory``; those of points stay until they are ``gone``.
+
+        A cloud is all that a camera saw, so that one that is not followed by another tells that the camera is silent.
 
         Args:
             seen: Names of those that were seen now.
             watched: Time since the last observation [s].
         """
         for track in (*self.tracks.values(), *self.doubted):
-            track.unseen += watched if track.shape.name not in seen else 0.0
+            track.unseen += watched if track.shape.name not in seen and track.shape.points is None else 0.0
         self.tracks = {name: track for name, track in self.tracks.items() if track.unseen <= self.memory}
         self.doubted = [track for track in self.doubted if track.unseen <= self.memory]
 
@@ -265,15 +324,18 @@ class Tracker:
     def reachable(self, error: float, fastest: float, margin: float = 0.0, q: Array | None = None) -> DynamicObstacles:
         """Return the reachable sets of the obstacles: seen within an error [m], and no faster than a speed [m/s].
 
-        Each observation bounds the place of an obstacle by a ball that grows with time. The ball that leaves a robot at
-        a state, shape (dof,), most room counts. Where observations contradict each other, an obstacle can be at each of
-        the places, which are obstacles of their own here.
+        An observation with an error of its own has that one. Each observation bounds the place of an obstacle by a ball
+        that grows with time. The ball that leaves a robot at a state, shape (dof,), most room counts. Where
+        observations contradict each other, an obstacle can be at each of the places, which are obstacles of their own
+        here.
         """
         tracks = (*self.tracks.values(), *self.doubted)
         if not tracks:
             return self._as_seen(error + margin, fastest)
-        looks = np.array([track.looks[-1] if q is None else self._best_look(track, fastest, q) for track in tracks])
+        some = [track.looks[-1] if q is None else self._best_look(track, error, fastest, q) for track in tracks]
+        looks, own = np.split(np.array(some), [1 + AXES], axis=1)
         still, growth = np.zeros((len(tracks), AXES)), np.tile((error + margin, fastest), (len(tracks), 1))
+        growth[:, 0] = np.where(np.isnan(own[:, 0]), growth[:, 0], own[:, 0] + margin)
         if not self.doubted:
             return self._dynamic().placed(looks[:, 1:], still, growth, looks[:, 0])
         names = [f"{k}: {track.shape.name}" for k, track in enumerate(tracks)]
@@ -281,12 +343,21 @@ class Tracker:
         shapes = [t.shape.model_copy(update={"name": name}) for t, name in zip(tracks, names, strict=True)]
         return DynamicObstacles(shapes, pairs).placed(looks[:, 1:], still, growth, looks[:, 0])
 
-    def _best_look(self, track: Track, fastest: float, q: Array) -> Array:
-        """Return the observation whose ball leaves a robot at a state most room, by the nearest ball of its cover."""
+    def _best_look(self, track: Track, error: float, fastest: float, q: Array) -> Array:
+        """Return the observation whose ball leaves a robot at a state most room, by the nearest ball of its cover.
+
+        Args:
+            track: The track.
+            error: Largest error of observations without one of their own [m].
+            fastest: Largest speed [m/s].
+            q: The state, shape (dof,).
+        """
         looks = np.array(track.looks)
+        places, own = looks[:, 1 : 1 + AXES], looks[:, -1]
         centers, radii = self._balls(q)
-        nearest = centers[np.argmin(np.linalg.norm(centers - looks[-1, 1:], axis=1) - radii)]
-        room = np.linalg.norm(looks[:, 1:] - nearest, axis=1) + fastest * looks[:, 0]
+        nearest = centers[np.argmin(np.linalg.norm(centers - places[-1], axis=1) - radii)]
+        larger = np.where(np.isnan(own), 0.0, own - error)  # than the assumed error
+        room = np.linalg.norm(places - nearest, axis=1) + fastest * looks[:, 0] - larger
         found: Array = looks[np.argmax(room)]
         return found
 

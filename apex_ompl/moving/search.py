@@ -22,7 +22,7 @@ from apex_ompl.moving.motion_optimizer import (
     shortest_duration,
 )
 from apex_ompl.moving.replanner import Request
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import Obstacle, same_solid
 from apex_ompl.scene.scripts import standing, vector
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.ruckig_method import between
@@ -245,11 +245,13 @@ def fresh_checker(context: RunContext) -> CollisionChecker:
 
 
 def place(checker: CollisionChecker, obstacle: Obstacle, position: ArrayLike) -> None:
-    """Place an obstacle at a position, shape (3,) [m], as a static one."""
+    """Place an obstacle at a position, shape (3,) [m], as a static one; its shape may be another than before."""
     if checker.is_obstacle(obstacle.name):
-        checker.move(obstacle.name, vector(position))
-    else:
-        checker.add(standing(obstacle).model_copy(update={"position": vector(position)}))
+        if same_solid(checker.obstacle(obstacle.name), obstacle):
+            checker.move(obstacle.name, vector(position))
+            return
+        checker.remove(obstacle.name)
+    checker.add(standing(obstacle).model_copy(update={"position": vector(position)}))
 
 
 def place_nearest(checker: CollisionChecker, search: Search, goal: Array) -> None:

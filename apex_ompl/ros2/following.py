@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,7 +18,7 @@ from apex_ompl.loop.result import Outcome
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.query import Target
 from apex_ompl.ros2.parameters import NodeSettings
-from apex_ompl.ros2.scene import Inbox, Scene
+from apex_ompl.ros2.scene import CLOUD, Inbox, Scene
 from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.files import NANOSECONDS
 from apex_ompl.types import Array
@@ -68,6 +70,7 @@ class Follower:
     motion: Trajectory | None = None
     motion_start: float = 0.0
     late: int = 0
+    _live: bool = False  # whether the closed loop observes clouds
 
     def state_at(self, stamp: int) -> Array:
         """Return the measured positions at a time of the node's clock [ns], shape (dof,); without one those of now."""
@@ -88,6 +91,7 @@ class Follower:
         ended: Ended | None = None
         while ended is None:
             self.synchronize()
+            self.refresh()
             ended = self._by_loop(target) if self._moves() else self._by_plan(target)
         return ended
 
@@ -189,15 +193,20 @@ class Follower:
         self.scene.remove_observed()
         problem = planner.problem(self._start(), target, "goal")
         recent = self._nanoseconds(driver.time - settings.loop.memory)
-        awaited = [name for name, (stamp, _) in self.scene.observed.items() if stamp >= recent]
+        self._live = self.inbox.clouds_come(recent)
+        if self._live:  # then the cloud does not stand
+            problem = problem.model_copy(update={"scene": tuple(o for o in problem.scene if o.name != CLOUD)})
         with Loop(
             problem, settings.method, settings=settings.loop, speed=settings.speed, seed=settings.seed,
-            tolerance=settings.tolerance, awaited=awaited,
-        ) as loop:  # fmt: skip
+            tolerance=settings.tolerance,
+        ) as loop, self._clouds(loop):  # fmt: skip
             while driver.time < driver.end:
                 time.sleep(LOOK)
             self.tell("following the closed loop")
-            self.scene.observations(self.state_at)  # those from before the first step are of no use to it
+            self.scene.observations(self.state_at)
+            for stamp, obstacle in self.scene.observed.values():
+                if stamp >= recent:
+                    loop.observe(float(driver.times_of(stamp)), [obstacle])
             while loop.outcome is None:
                 self._step(loop)
                 time.sleep(TICK)
@@ -216,26 +225,45 @@ class Follower:
             loop.abort(interruption.reason)
         elif self.driver.fault:
             loop.abort(self.driver.fault)
-        elif self.inbox.world:
+        elif self.inbox.world or (self.inbox.cloud is not None and not self._live):
             loop.abort(CHANGED)
         for stamp, obstacles in self.scene.observations(self.state_at):
             loop.observe(float(self.driver.times_of(stamp)), obstacles)
         now = self.driver.time
-        command = loop.step(now, self._measured(now))
+        try:
+            state = self.driver.state()
+            command = loop.step(now, state.positions, state.stamp)
+        except DriverError:  # the robot is silent
+            command = loop.step(now, np.full(len(self.driver.names), np.nan))
         if command is not None:
             self._send(loop, command)
 
-    def _measured(self, now: float) -> Array:
-        """Return the positions at a time that has just come [s], shape (dof,); NaN where the robot is silent.
-
-        They are those commanded, off by as much as at the last measurement.
-        """
-        driver = self.driver
+    @contextmanager
+    def _clouds(self, loop: Loop) -> Iterator[None]:
+        """Let the loop observe the clouds that come inside the block, in a thread of their own, where they are live."""
+        over = threading.Event()
+        thread = threading.Thread(target=self._observe_clouds, args=(loop, over))
+        if self._live:
+            thread.start()
         try:
-            state = driver.state()
-        except DriverError:
-            return np.full(len(driver.names), np.nan)
-        return np.asarray(driver.commanded(now)[0] + state.positions - driver.commanded(state.stamp)[0])
+            yield
+        finally:
+            over.set()
+            if self._live:
+                thread.join()
+                self.scene.place_cloud()
+
+    def _observe_clouds(self, loop: Loop, over: threading.Event) -> None:
+        scene, comes = self.scene, True  # the last cloud before the loop is its first
+        try:
+            while not over.is_set():
+                if comes:
+                    at = float(self.driver.times_of(scene.cloud_stamp))
+                    loop.observe(at, clouds={CLOUD: scene.cloud}, radius=scene.radius)
+                self.inbox.wait_for_cloud(LOOK)
+                comes = scene.take_cloud(self.settings(), self.state_at)
+        except ApexError as error:
+            loop.abort(str(error))
 
     def _send(self, loop: Loop, command: Command) -> None:
         """Send a command; where it is too late the loop follows the one before."""

@@ -140,7 +140,8 @@ class ApexNode:
         self._inbox.put(lambda: setattr(self._inbox, "goal", Goal(frames, message)))
 
     def _take_cloud(self, message: Any) -> None:
-        self._inbox.put(lambda: setattr(self._inbox, "cloud", message))
+        received = self._node.get_clock().now().nanoseconds
+        self._inbox.put(lambda: self._inbox.add_cloud(received, message))
 
     def _take_seen(self, name: str, message: Any) -> None:
         received = self._node.get_clock().now().nanoseconds

@@ -55,7 +55,8 @@ class Inbox:
     Attributes:
         changed: Tells that something came, or that the node is to end.
         goal: The newest goal, which replaces the one before.
-        cloud: The newest cloud.
+        cloud: Time of reception [ns], and the newest cloud.
+        cloud_times: Times of reception of the last two clouds [ns].
         world: Edits of the world, ``visualization_msgs/MarkerArray``.
         seen: Times of reception [ns] and observations, as markers, or as a pose and the name of the obstacle.
         ended: Whether the node is to end.
@@ -63,7 +64,8 @@ class Inbox:
 
     changed: threading.Condition = field(default_factory=threading.Condition)
     goal: Goal | None = None
-    cloud: Any = None
+    cloud: tuple[int, Any] | None = None
+    cloud_times: deque[int] = field(default_factory=lambda: deque(maxlen=2))
     world: deque[Any] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
     seen: deque[tuple[int, Any, str]] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
     ended: bool = False
@@ -73,6 +75,16 @@ class Inbox:
         with self.changed:
             change()
             self.changed.notify_all()
+
+    def add_cloud(self, received: int, message: Any) -> None:
+        """Take a cloud at a time [ns], in place of the one that waits."""
+        self.cloud = received, message
+        self.cloud_times.append(received)
+
+    def clouds_come(self, since: int) -> bool:
+        """Whether two clouds came since a time [ns]: a camera is at work."""
+        with self.changed:
+            return len(self.cloud_times) > 1 and min(self.cloud_times) >= since
 
     def waits(self) -> bool:
         """Whether something waits; a cloud alone, of which many may come, does not count."""
@@ -89,7 +101,12 @@ class Inbox:
             goal, self.goal = self.goal, None
             return goal
 
-    def take_cloud(self) -> Any:
+    def wait_for_cloud(self, timeout: float) -> None:
+        """Wait for a cloud, at most for a time [s]."""
+        with self.changed:
+            self.changed.wait_for(lambda: self.cloud is not None, timeout)
+
+    def take_cloud(self) -> tuple[int, Any] | None:
         """Return the cloud that waits, if any."""
         with self.changed:
             cloud, self.cloud = self.cloud, None
@@ -118,6 +135,8 @@ class Scene:
         observed: The observed obstacles by name, where they were seen last, with the time of the node's clock [ns].
         refused: Number of messages that were refused.
         cloud: The points of the last cloud, shape (N, 3) [m].
+        cloud_stamp: Time by the node's clock when they were there [ns].
+        radius: Radius of the balls around them [m].
     """
 
     def __init__(
@@ -134,7 +153,7 @@ class Scene:
             warn: Tells why a message is refused.
         """
         self.planner, self.observed, self.refused = planner, dict[str, tuple[int, Obstacle]](), 0
-        self.cloud = np.zeros((0, 3))
+        self.cloud, self.cloud_stamp, self.radius = np.zeros((0, 3)), 0, 0.0
         self._frames, self._inbox, self._tracked, self._warn = frames, inbox, dict(tracked), warn
         self._sources: dict[str, list[str]] = {}  # names of the obstacles that a marker made
         self._placed = set[str]()  # names of the observed obstacles that are in the world
@@ -146,13 +165,32 @@ class Scene:
             settings: Values of parameters.
             state_at: Returns the state at a time of the node's clock [ns], shape (dof,).
         """
-        world, cloud = self._inbox.take_world(), self._inbox.take_cloud()
+        world = self._inbox.take_world()
         for message in world:
             for marker in message.markers:
                 self._try(self._edit, marker, state_at)
-        if cloud is not None:
-            self._try(self._set_cloud, cloud, settings, state_at)
-        return bool(world) or cloud is not None
+        seen = self.take_cloud(settings, state_at)
+        if seen:
+            self.place_cloud()
+        return bool(world) or seen
+
+    def take_cloud(self, settings: NodeSettings, state_at: Callable[[int], Array]) -> bool:
+        """Take the cloud that waits as :attr:`cloud`; return whether there was one that was not refused.
+
+        Args:
+            settings: Values of parameters.
+            state_at: Returns the state at a time of the node's clock [ns], shape (dof,).
+        """
+        waiting = self._inbox.take_cloud()
+        return waiting is not None and bool(self._try(self._read_cloud, *waiting, settings, state_at))
+
+    def place_cloud(self) -> None:
+        """Put the last cloud into the world, in place of the one before."""
+        world = self.planner.world
+        if len(self.cloud):
+            self._try(world.set_points, CLOUD, self.cloud, self.radius)
+        elif CLOUD in world.obstacles:
+            world.remove(CLOUD)
 
     def observations(self, state_at: Callable[[int], Array]) -> list[tuple[int, tuple[Obstacle, ...]]]:
         """Take the observations that wait, and return them with their stamps by the node's clock [ns]."""
@@ -215,16 +253,18 @@ class Scene:
             if name in self.planner.world.obstacles:
                 self.planner.world.remove(name)
 
-    def _set_cloud(self, cloud: Any, settings: NodeSettings, state_at: Callable[[int], Array]) -> None:
-        world, robot, radius = self.planner.world, self.planner.robot, HALF_DIAGONAL * settings.cell
-        q = state_at(nanoseconds(cloud.header.stamp))
-        points = moved(cloud_points(cloud), self._frames.pose(cloud.header.frame_id, q))
-        points = filter_points(thinned(points, settings.cell), robot, q, radius + settings.margin, world.held.values())
-        self.cloud = points
-        if len(points):
-            world.set_points(CLOUD, points, radius)
-        elif CLOUD in world.obstacles:
-            world.remove(CLOUD)
+    def _read_cloud(
+        self, received: int, cloud: Any, settings: NodeSettings, state_at: Callable[[int], Array]
+    ) -> bool:  # fmt: skip
+        """Take the points of a cloud that are not on the robot, and return True."""
+        planner, radius = self.planner, HALF_DIAGONAL * settings.cell
+        stamp = nanoseconds(cloud.header.stamp) or received
+        q = state_at(stamp)
+        points = thinned(moved(cloud_points(cloud), self._frames.pose(cloud.header.frame_id, q)), settings.cell)
+        held = planner.world.held.values()
+        self.cloud = filter_points(points, planner.robot, q, radius + settings.margin, held)
+        self.cloud_stamp, self.radius = stamp, radius
+        return True
 
     def _seen(
         self, received: int, message: Any, name: str, state_at: Callable[[int], Array]

@@ -5,6 +5,7 @@ Lengths are in meters, masses in kilograms, the world has z up, quaternions are 
 
 from __future__ import annotations
 
+import base64
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -74,7 +75,25 @@ class RoundBar(StrictModel):
     length: Size
 
 
-class MeshFile(StrictModel):
+def _base64(text: str | None) -> str | None:
+    try:
+        base64.b64decode(text or "", validate=True)
+    except ValueError as error:
+        raise ValueError(f"expected the content of the file in base64 ({error})") from error
+    return text
+
+
+class FileShape(StrictModel):
+    """A shape from a file.
+
+    Attributes:
+        content: Content of the file in base64, from memory: the file is not read then, and its name tells the format.
+    """
+
+    content: Annotated[str | None, AfterValidator(_base64), Field(repr=False)] = None
+
+
+class MeshFile(FileShape):
     """A triangle mesh from a file; a relative path is relative to the problem file.
 
     A ``solid`` has an inside and must be closed; with ``solid`` false the mesh is a surface. By default a mesh is a
@@ -93,14 +112,14 @@ class MeshFile(StrictModel):
         return scale
 
 
-class PointFile(StrictModel):
+class PointFile(FileShape):
     """Balls of one radius [m] around the points of a file; a relative path is relative to the problem file."""
 
     file: Annotated[str, _ending_in(POINT_SUFFIXES, "file of points")]
     radius: Size
 
 
-class GridFile(StrictModel):
+class GridFile(FileShape):
     """Cells of a grid from a file (:mod:`apex_ompl.scene.grids`); a relative path is relative to the problem file."""
 
     file: Annotated[str, _ending_in(GRID_SUFFIXES, "file of a grid")]
@@ -315,7 +334,7 @@ def located(body: BodyT, folder: Path) -> BodyT:
     """Return a body whose file, if any, has an absolute path; a relative path is relative to ``folder``."""
     for name in FILES:
         shape = getattr(body, name)
-        if shape is not None:
+        if shape is not None and shape.content is None:
             file = os.path.abspath(folder / shape.file)
             return body.model_copy(update={name: shape.model_copy(update={"file": file})})
     return body

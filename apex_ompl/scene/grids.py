@@ -8,18 +8,20 @@ A ``.bt`` file holds a map of OctoMap in its binary format (Hornung et al. 2013)
 
 from __future__ import annotations
 
+import base64
 import io
 import math
 from typing import IO
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from apex_ompl.errors import FileFormatError
+from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.scene.bodies import VoxelFile
 from apex_ompl.scene.meshes import LARGEST
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.files import BROKEN
-from apex_ompl.util.validation import is_number
+from apex_ompl.util.validation import check_array, check_positive, finite_array, is_number
 
 OCTOMAP_HEAD = b"# Octomap OcTree binary file"
 OCTOMAP_DEPTH = 16  # of the tree of OctoMap: the side of the whole map is 2^16 cells
@@ -93,6 +95,29 @@ def _full_nodes(content: bytes, at: int) -> list[tuple[int, int, int, int]]:
                 inner.append(place)
         waiting += inner[::-1]
     return found
+
+
+def voxels_of(occupied: ArrayLike, resolution: float, origin: ArrayLike) -> VoxelFile:
+    """Return cells in memory as the ``voxels`` of an obstacle, which no file is needed for.
+
+    Args:
+        occupied: Cells that are full, those that are not 0, shape (nx, ny, nz).
+        resolution: Side of a cell [m].
+        origin: Outer corner of the first cell, shape (3,) [m].
+
+    Raises:
+        ParameterError: An argument has another shape, is not finite, or no cell is full.
+    """
+    cells, corner = np.asarray(occupied) != 0, finite_array(origin, "origin")
+    if cells.ndim != 3:
+        raise ParameterError("occupied", cells.shape, "an array of shape (nx, ny, nz)")
+    check_array(corner, (3,), "origin")
+    check_positive(resolution, "resolution", "a positive number of meters")
+    if not cells.any():
+        raise ParameterError("occupied", "no cell that is full", "one or more")
+    content = io.BytesIO()
+    np.savez_compressed(content, occupied=cells, resolution=resolution, origin=corner)
+    return VoxelFile(file="memory.npz", content=base64.b64encode(content.getvalue()).decode())
 
 
 def parse_surface(file: str, content: bytes) -> tuple[Array, NDArray[np.int64]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.scene.bodies import PointFile
 from apex_ompl.types import Array
 from apex_ompl.util.files import BROKEN
-from apex_ompl.util.validation import check_array, check_integer, finite_array, number_array, rigid_pose
+from apex_ompl.util.validation import check_array, check_integer, check_positive, finite_array, number_array, rigid_pose
 
 LARGEST = 1e4  # larger coordinates are errors [m]
+MILLIMETER = 1e-3  # unit of depth images of whole numbers [m]
+FEW, MANY = 50, 50.0  # depths of whole numbers are larger [mm], medians of others are not [m]
+SAMPLED = 10_000  # pixels by which the unit of an image is checked
 PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -281,6 +286,55 @@ def _ply_row(element: Element, body: bytes, at: int, order: str) -> tuple[np.dty
     return (np.dtype(fields), lengths) if at + size <= len(body) else (None, lengths)
 
 
+def depth_in_meters(depth: ArrayLike) -> Array:
+    """Return a depth image in meters, shape (rows, columns).
+
+    Whole numbers are millimeters, others meters, as ROS has it (REP 118).
+
+    Raises:
+        ParameterError: It is not an image, has masked numbers, or its numbers are not of that unit.
+    """
+    image = number_array(depth, "depth")
+    if image.ndim != 2:
+        raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
+    if np.asarray(depth).dtype.kind in "iu":
+        largest = image.max(initial=0.0)
+        if 0.0 < largest <= FEW:
+            raise ParameterError("depth", f"whole numbers up to {largest:g}", "millimeters, or floats in meters")
+        return image * MILLIMETER
+    pixels = image.ravel()
+    seen = _depths(pixels[:: 1 + pixels.size // SAMPLED])
+    if not len(seen):
+        seen = _depths(pixels)
+    if len(seen) and np.median(seen) > MANY:
+        raise ParameterError("depth", f"floats around {np.median(seen):g}", "meters, or whole numbers in millimeters")
+    return image
+
+
+def _depths(pixels: Array) -> Array:
+    """Return the numbers that are depths."""
+    with np.errstate(invalid="ignore"):
+        return pixels[np.isfinite(pixels) & (pixels > 0.0)]
+
+
+def points_of(points: ArrayLike, radius: float) -> PointFile:
+    """Return balls in memory as the ``points`` of an obstacle, which no file is needed for.
+
+    Args:
+        points: Their centers, shape (N, 3) [m].
+        radius: Their radius [m].
+
+    Raises:
+        ParameterError: The points have another shape or are not finite, there are none, or the radius is not positive.
+    """
+    cloud = finite_array(points, "points")
+    check_array(cloud, ("N", 3), "points", least=1)
+    check_positive(radius, "radius", "a positive number of meters")
+    content = io.BytesIO()
+    np.save(content, cloud.astype(np.float32))
+    return PointFile(file="memory.npy", radius=radius, content=base64.b64encode(content.getvalue()).decode())
+
+
 def points_from_depth(
     depth: ArrayLike, intrinsics: tuple[float, float, float, float], pose: ArrayLike, stride: int = 1,
     range: tuple[float, float] = (0.1, 5.0),
@@ -291,19 +345,17 @@ def points_from_depth(
     camera's optical frame, z forward, x right, y down. Pixels that are not finite or out of range are left out.
 
     Args:
-        depth: Depths, shape (rows, columns) [m].
+        depth: Depths, shape (rows, columns): whole numbers [mm], or floats [m].
         intrinsics: Focal lengths fx, fy and principal point cx, cy [pixels].
         pose: Pose of the optical frame in the world, shape (4, 4) [m]: a rotation and a translation.
         stride: Stride of rows and columns.
         range: Least and largest depth that is taken [m].
 
     Raises:
-        ParameterError: An argument has another shape, is out of its range, or has masked numbers, which a NaN can stand
-            for; the pose is not rigid.
+        ParameterError: An argument has another shape, another unit, is out of its range, or has masked numbers, which
+            a NaN can stand for; the pose is not rigid.
     """
-    image = number_array(depth, "depth")
-    if image.ndim != 2:
-        raise ParameterError("depth", image.shape, "an image of shape (rows, columns)")
+    image = depth_in_meters(depth)
     camera, placement = finite_array(intrinsics, "intrinsics"), rigid_pose(pose, "pose")
     check_array(camera, (4,), "intrinsics")
     focal_x, focal_y, center_x, center_y = camera.tolist()

@@ -11,9 +11,15 @@ AT_REST = 1e-6
 """Largest velocity of a joint at rest [rad/s]."""
 
 
-def is_at_rest(motion: Trajectory, time: float) -> bool:
-    """Whether no joint is faster than ``AT_REST`` at a time [s]; before 0 and after the end the robot is at rest."""
-    return bool((np.abs(motion(time, 1)) <= AT_REST).all())
+def is_at_rest(motion: Trajectory, time: float, rest: float = AT_REST) -> bool:
+    """Whether no joint is faster than at rest at a time; before 0 and after the end the robot is at rest.
+
+    Args:
+        motion: The motion.
+        time: The time [s].
+        rest: Largest velocity of a joint at rest [rad/s].
+    """
+    return bool((np.abs(motion(time, 1)) <= rest).all())
 
 
 def rests(motion: Trajectory) -> Array:

@@ -21,6 +21,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
+from apex_ompl.util.cache import weakly_cached
 
 ROBOT, HELD, FACES, FIXTURES, OBSTACLES = LAYERS = ("robot", "held", "faces", "fixtures", "obstacles")
 """Layers of items: the first three move with the robot."""
@@ -106,18 +107,30 @@ def ghosts_of(setup: PlanningSetup) -> list[Item]:
     return [replace(item, opacity=GHOST_OPACITY) for item in items if item.moves]
 
 
-def robot_items(robot: Robot, coarse: bool = False) -> Iterator[Item]:
-    """Yield the visual meshes of a robot's links, or its coarser collision geometry."""
-    if coarse:
-        shapes = robot.geometry
-    else:
-        shapes = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL)
+def robot_items(robot: Robot, coarse: bool = False) -> Sequence[Item]:
+    """Return the visual meshes of a robot's links, or its coarser collision geometry."""
+    return _coarse_items(robot) if coarse else _visual_items(robot)
+
+
+@weakly_cached
+def _visual_items(robot: Robot) -> Sequence[Item]:
+    return _items_of(robot, pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.VISUAL))
+
+
+@weakly_cached
+def _coarse_items(robot: Robot) -> Sequence[Item]:
+    return _items_of(robot, robot.geometry)
+
+
+def _items_of(robot: Robot, shapes: pin.GeometryModel) -> tuple[Item, ...]:
+    found = []
     for k, item in enumerate(shapes.geometryObjects):
         is_hand = "hand" in item.name or "gripper" in item.name
         color = HAND if is_hand else SIDE_COLORS.get(item.name.split("_", 1)[0], LINK)
         link = robot.model.frames[item.parentFrame].name
         place = np.array(item.placement.homogeneous)
-        yield Item(f"{k}_{item.name}", ROBOT, link, color, 1.0, item.parentJoint, place, mesh_of(item.geometry))
+        found.append(Item(f"{k}_{item.name}", ROBOT, link, color, 1.0, item.parentJoint, place, mesh_of(item.geometry)))
+    return tuple(found)
 
 
 def held_items(setup: PlanningSetup) -> Iterator[Item]:

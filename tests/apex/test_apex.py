@@ -179,11 +179,11 @@ def test_more_of_a_region_is_drawn_where_the_first_goal_cannot_be_reached() -> N
     beyond[0] = 2.0
     setup.setStateValidityChecker(UserValidityChecker(si, lambda q: not 1.4 < q[0] < 1.6))
     setup.setStartState(to_state(si, ready.start))
-    goal = Region(si, np.stack([*[beyond] * 40, ready.goals[0]]))
+    goal = Region(si, np.stack([*[beyond] * 12, ready.goals[0]]))
     setup.setGoal(goal)
     setup.setPlanner(APEX(si, ApexParameters(seed=0, line=False, model="none")))
     assert setup.solve(within(20.0)).getStatus() == EXACT
-    assert np.array_equal(states(setup)[-1], ready.goals[0]) and goal.count > 40
+    assert np.array_equal(states(setup)[-1], ready.goals[0]) and goal.count > 12
 
 
 def test_a_goal_that_cannot_be_sampled_is_refused(ready: PlanningSetup) -> None:

@@ -103,7 +103,7 @@ def test_valid_paths_that_pass_too_near_are_resampled(ready: PlanningSetup) -> N
 
 def test_paths_of_trees_are_not_cut_nearer_to_obstacles_than_is_wanted(ready: PlanningSetup) -> None:
     validator, cut = PathValidator(ready.simple_setup.getSpaceInformation(), ""), 0
-    for seed in range(8):
+    for seed in range(4):
         params = {"lambda_obs": 0.05, "line": False, "first": 0, "second": 0, "third": 0}
         found = [
             plan(cached_problem(HARD), timeout=20.0, seed=seed, simplify=False, params={**params, "polish": polish})
@@ -112,7 +112,7 @@ def test_paths_of_trees_are_not_cut_nearer_to_obstacles_than_is_wanted(ready: Pl
         first, last = (validator.obstacle_distance(result.path.states) for result in found)
         assert last >= min(0.05, first) - 5e-3  # the first one's is taken at states 0.1 rad apart
         cut += found[1].length < found[0].length
-    assert cut >= 4
+    assert cut >= 2
 
 
 @pytest.mark.parametrize(("sprint", "by"), [(0, "apex"), (ApexParameters().sprint, "sprint")])
@@ -134,7 +134,7 @@ def test_a_long_way_round_is_taken_where_other_trees_find_no_shorter_one(monkeyp
     def lengths(others: int) -> list[float]:
         monkeypatch.setattr(shorten, "OTHERS", others)
         found = []
-        for seed in range(6):
+        for seed in range(4):
             params = {"model": "none", "line": False, "seed": seed, "polish": True}
             result = plan(cached_problem("cage/hard/800000"), timeout=20.0, params=params)
             assert result and result.solved_by == "sprint"
@@ -154,7 +154,7 @@ def test_with_time_left_paths_only_get_shorter(ready: PlanningSetup) -> None:
     planner = APEX(si, seed=0, sprint=0, anytime=True)
     setup.setPlanner(planner)
     setup.setup()
-    assert setup.solve(within(3.0)).getStatus() == EXACT
+    assert setup.solve(within(2.0)).getStatus() == EXACT
     found = setup.getProblemDefinition().getSolutionCount()
     assert "improve" in planner.report.times
     once = plan(cached_problem(HARD), timeout=20.0, params={"seed": 0, "sprint": 0})

@@ -54,7 +54,7 @@ def saved(few: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_few_paths_are_learned(few: Path, tmp_path: Path) -> None:
     """The error falls far below that of straight lines, and the policy's own path follows the stored one."""
     network = {**NETWORK, "width": 64}
-    changes: dict[str, Any] = {"steps": 350, "rate": 3e-3, "cooldown": 100, "ema": 0.98, "noise": 0.01, "batch": 16}
+    changes: dict[str, Any] = {"steps": 230, "rate": 4e-3, "cooldown": 70, "ema": 0.98, "noise": 0.01, "batch": 16}
     trainer = ImitationTrainer(config(few, log_every=10_000, **changes).model_copy(update={
         "network": NetworkConfig.model_validate(network)}), tmp_path)  # fmt: skip
     trainer.run()
@@ -107,17 +107,18 @@ def test_a_policy_of_other_obstacles_begins_with_the_weights_of_another(saved: P
         ImitationTrainer(config(few, obstacles="point"), tmp_path)
 
 
-def test_the_script_trains_resumes_and_needs_no_ompl(few: Path, tmp_path: Path) -> None:
+def test_the_script_trains_resumes_and_needs_no_ompl(few: Path, tmp_path: Path, script_here: Any) -> None:
     file, script = tmp_path / "small.yaml", ROOT / "scripts" / "train_il.py"
     file.write_text(yaml.safe_dump({**SMALL, "data": str(few), "steps": 4}))
     code = "import sys\nfor name in ('ompl', 'pinocchio', 'coal', 'ruckig'):\n    sys.modules[name] = None\n"
     code += f"sys.argv = ['train_il.py', {str(file)!r}, '--out', {str(tmp_path / 'run')!r}, '--quiet', *sys.argv[1:]]\n"
     code += f"exec(compile(open({str(script)!r}).read(), {str(script)!r}, 'exec'), {{'__name__': '__main__', "
     code += f"'__file__': {str(script)!r}}})\n"
-    for steps in ("4", "9"):
-        done = subprocess.run(
-            [sys.executable, "-c", code, "--set", f"steps={steps}"], check=False, capture_output=True, text=True
-        )
+    first = subprocess.run(
+        [sys.executable, "-c", code, "--set", "steps=4"], check=False, capture_output=True, text=True
+    )
+    again = script_here(script.name, file, "--out", tmp_path / "run", "--quiet", "--set", "steps=9")
+    for done, steps in ((first, 4), (again, 9)):
         assert done.returncode == 0, done.stderr
         assert f"step {steps} of {steps}" in done.stdout
     network, about = load_policy_network(tmp_path / "run" / "checkpoint")

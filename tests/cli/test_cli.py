@@ -212,7 +212,7 @@ def set_up() -> float:
 
 @pytest.mark.parametrize(
     ("planner", "settings"),
-    [("rrtconnect", ["range=0.001"]), ("prm", ["max_nearest_neighbors=1"]), ("prmstar", []), ("rrtstar", [])],
+    [("rrtconnect", ["range=0.001"]), ("prm", ["max_nearest_neighbors=1"]), ("rrtstar", [])],
 )
 def test_ctrl_c_ends_a_plan_with_its_exit_code_and_no_output(
     planner: str, settings: list[str], set_up: float, tmp_path: Path

@@ -86,15 +86,15 @@ def test_broadphase_agrees_with_a_plain_loop(robot: Robot) -> None:
 @pytest.mark.parametrize("proofs", [True, False])
 def test_the_quick_test_finds_collisions_only_where_there_are_some(robot: Robot, proofs: bool) -> None:
     rng, found, colliding = np.random.default_rng(3), 0, 0
-    for _ in range(6):
+    for _ in range(3):
         checker = CollisionChecker(robot, clutter(rng, 4), proofs=proofs)
-        for _ in range(6):
+        for _ in range(8):
             path = states_around_home(robot, rng, 2, 0.5)
             states = path[0] + TESTED[:, None] * (path[1] - path[0])
             there, quick = not checker.are_free(states).all(), checker.collides_along(path)
             assert there or not quick
             found, colliding = found + quick, colliding + there
-    assert colliding > 10 and found >= 0.9 * colliding
+    assert colliding > 6 and found >= 0.9 * colliding
     assert not CollisionChecker(robot, proofs=proofs).collides_along(robot.home[None])
     with pytest.raises(ParameterError):
         checker.collides_along(np.zeros((2, 3)))

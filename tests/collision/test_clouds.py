@@ -62,7 +62,7 @@ def touched(robot: Robot, q: np.ndarray, points: np.ndarray, radius: float) -> b
     return False
 
 
-@settings(max_examples=12)
+@settings(max_examples=6)
 @given(seed=st.integers(0, 10**6), radius=st.sampled_from([0.002, 0.01, 0.03]))
 def test_states_touch_a_cloud_where_a_ball_touches_a_link(
     robot: Robot, tmp_path_factory: pytest.TempPathFactory, seed: int, radius: float

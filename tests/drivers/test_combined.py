@@ -158,7 +158,7 @@ def test_hands_that_do_not_follow_are_stopped(robot: Robot, what: str) -> None:
     driver = FunctionDriver(
         robot, robot.joint_names[HANDS], hands.command, hands.measure, guard=Guard(hand_tracking=0.1)
     )  # fmt: skip
-    motion = hand_motion(robot, 0.6)
+    motion = hand_motion(robot, 0.6).slower(5.0)  # so that there is time to stop on a busy machine
     start = driver.time + 0.02
     driver.send(motion, start)
     wait(lambda: driver.time > start + 0.1)

@@ -11,8 +11,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import apex_ompl
 from apex_ompl.cli.parser import _parser
+from apex_ompl.perception import Camera, Frame, look_at, save_sequence
 
 ELSEWHERE = {"--address"}  # needs a Ray cluster
 BLOCK = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
@@ -58,6 +61,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ((0, 1), "run own.yaml --clock real --timeout 3 --out real.json"),
     ((0, 1, 2), "run own.yaml --driver mujoco --seed 1 --timeout 20 --out task.npz --json"),  # 2 without MuJoCo
     ((2,), "run own.yaml --driver mujoco --film task.gif"),
+    ((0, 1), "run own.yaml --driver kinematic --timeout 3"),
     ((2,), "ros2 own.yaml --ros-args -p speed:=7.0"),  # without ROS as well as with a faulty parameter
     ((0,), "render plan.npz --out plan.png --azimuth 10"),
     ((0,), "plot plan.npz --out plan.svg"),
@@ -71,6 +75,12 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ((0,), "check converted.yaml"),
     (
         (0,),
+        "calibrate frames --board charuco:5x4:0.06 --board-link left_hand_palm --offsets left_joint2 --camera eye.yaml "
+        "--robot dual_panda_softhand --out camera.yaml",
+    ),
+    ((0,), "calibrate others --board charuco:5x4:0.06 --camera-link left_hand_palm --out carried.yaml"),
+    (
+        (0,),
         "bench posts/easy --planners apex,rrtconnect --runs 1 --timeout 5 --seed 1 --split validation --no-simplify "
         "--jobs 1 --keep --quiet --out results",
     ),
@@ -78,7 +88,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
 )
 WRITTEN = (
     "plan.npz", "motion.traj.yaml", "path.json", "run.npz", "real.json", "plan.png", "plan.svg", "run.png", "page.html",
-    "converted.yaml", "report/report.html", "report/report.md",
+    "converted.yaml", "camera.yaml", "carried.yaml", "report/report.html", "report/report.md",
 )  # fmt: skip
 
 
@@ -114,9 +124,46 @@ def _write_inputs() -> None:
         planner.problem(start, goal, "own").save("own.yaml")
         home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
     Path("params.yaml").write_text("range: 0.5\n")
+    _write_frames(robot)
     names, values = ", ".join(["panda_joint1", *robot.joint_names[1:]]), ", ".join(map(str, home.values()))
     Path("scene.yaml").write_text(SCENE.replace("[panda_joint1]", f"[{names}]").replace("[0.0]", f"[{values}]"))
     Path("request.yaml").write_text(REQUEST)
+
+
+def _write_frames(robot: apex_ompl.Robot) -> None:
+    """Write frames of a board on the left hand, seen from the front, and of one that stands still, seen by the hand."""
+    camera = Camera(width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5))
+    palm = robot.link_pose(robot.home, "left_hand_palm")
+    before = look_at(palm[:3, 3] + [1.0, 0.2, 0.5], palm[:3, 3])
+    facing = before.copy()
+    facing[:3, 3] = palm[:3, 3]
+    camera.placed(before).save("eye.yaml")
+    for folder, carried in (("frames", False), ("others", True)):
+        rng, frames = np.random.default_rng(0), []
+        while len(frames) < 6:
+            q = robot.home + rng.normal(0.0, 0.3, robot.dof) * (np.arange(robot.dof) < 7)
+            moved = np.linalg.inv(palm) @ robot.link_pose(q, "left_hand_palm")  # of the hand, in its frame
+            board = np.linalg.inv(before) @ palm @ (np.linalg.inv(moved) if carried else moved) @ np.linalg.inv(palm)
+            color = _board_image(camera, board @ facing)
+            joints = dict(zip(robot.joint_names, q.tolist(), strict=True))
+            if color is not None:
+                frames.append(Frame(camera, np.zeros((480, 640)), color, float(len(frames)), joints))
+        save_sequence(frames, folder)
+
+
+def _board_image(camera: Camera, pose: Any) -> Any:
+    """Return the image of a board of 6 times 5 squares of 6 cm, or None where a part of it is outside."""
+    import cv2  # here, since the words of the calls are read without it
+
+    markers = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    board = cv2.aruco.CharucoBoard((6, 5), 0.06, 0.045, markers).generateImage((240, 200))
+    ends = np.array([[0, 0], [240, 0], [240, 200], [0, 200]], np.float32)
+    flat = np.concatenate([(ends - [120, 100]) * 0.06 / 40, np.zeros((4, 1))], axis=1)
+    seen = camera.project(flat @ pose[:3, :3].T + pose[:3, 3])
+    if not ((seen > 0.0) & (seen < (640, 480))).all() or pose[2, 2] < 0.5:
+        return None
+    warp = cv2.getPerspectiveTransform(ends - np.float32(0.5), seen.astype(np.float32))
+    return cv2.cvtColor(cv2.warpPerspective(board, warp, (640, 480), borderValue=128), cv2.COLOR_GRAY2RGB)
 
 
 def _serve() -> Iterator[str]:

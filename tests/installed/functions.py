@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
@@ -20,7 +21,7 @@ import numpy as np
 
 MODULES = (
     "apex_ompl", "apex_ompl.ompl.space", "apex_ompl.planners", "apex_ompl.problems", "apex_ompl.robot",
-    "apex_ompl.planning", "apex_ompl.timing",
+    "apex_ompl.perception", "apex_ompl.planning", "apex_ompl.timing",
 )  # fmt: skip
 
 
@@ -38,12 +39,14 @@ def run(root: Path) -> list[str]:
         _use_steps()
         _use_run()
         _use_drivers()
+        _use_perception()
     (Path("tests")).symlink_to(root / "tests")  # data that a page reads
     for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
         code = "\n".join(re.findall(r"```python\n(.*?)```", page.read_text(), re.S))
         with _traced(called, made), redirect_stdout(io.StringIO()):
             exec(compile(code, page.name, "exec"), {"__name__": "__page__"})
-    return [name for name, code, kind in _public() if code not in called and not any(issubclass(m, kind) for m in made)]
+    public = [one for one in _public() if find_spec("sensor_msgs") or "Ros2Camera" not in one[0]]
+    return [name for name, code, kind in public if code not in called and not any(issubclass(m, kind) for m in made)]
 
 
 @contextmanager
@@ -274,8 +277,10 @@ def _use_steps() -> None:
 
 
 def _use_run() -> None:
-    """The closed loop."""
+    """The closed loop, on its own clock and a driver's."""
     import apex_ompl
+    from apex_ompl.drivers import KinematicDriver
+    from apex_ompl.loop import Observation
 
     result = apex_ompl.run("popup/vertical/large/12", method="no-network")
     for name in ("run.npz", "run.json"):
@@ -283,14 +288,24 @@ def _use_run() -> None:
         assert apex_ompl.RunResult.load(name).as_dict() == result.as_dict()
     problem = apex_ompl.load_problem("vertical/free/1")
     settings = apex_ompl.LoopSettings(error=0.01, fastest=0.3)
+    ball = apex_ompl.Obstacle(name="ball", sphere={"radius": 0.05}, position=(1.5, 1.5, 1.0))
     with apex_ompl.Loop(problem, settings=settings) as loop:
-        loop.observe(0.0, [])
+        loop.observe(0.0, [ball], errors={"ball": 1e-4 * np.eye(3)}, clouds={"camera": np.full((5, 3), 2.0)})
         command = loop.step(0.0, problem.start_state(loop.joint_names))
         assert command is not None and command.rests and loop.outcome is None and loop.record is None
         assert loop.missed() is not None
         loop.abort("enough")
         assert loop.step(0.01) is not None and loop.outcome is not None and loop.reason == "enough"
         assert loop.events[-1].time <= 0.03
+
+    class Camera:
+        def read(self, now: float) -> Observation:
+            return Observation(now, now, (ball,))
+
+    robot = apex_ompl.load_robot(problem.robot)
+    driver = KinematicDriver(robot, problem.start_state(robot.joint_names))
+    result = apex_ompl.run(problem, "no-network", settings=settings, sensor=Camera(), driver=driver)
+    assert result.settings["driver"] == "KinematicDriver" and result.metrics["tracking_error"] < 1e-9
 
 
 def _use_drivers() -> None:
@@ -319,3 +334,113 @@ def _use_drivers() -> None:
     assert not whole.fault
     whole.close()
     assert FrankaSettings(rate=500.0).lead == 0.02
+
+
+def _use_perception() -> None:
+    """Calibration of a camera by corners as they would be found; docs/perception.md uses cameras and frames."""
+    import apex_ompl
+    from apex_ompl.perception import (
+        Board,
+        Camera,
+        DepthErrors,
+        Frame,
+        View,
+        calibrate,
+        load_frames,
+        look_at,
+        measured_depths,
+    )
+
+    robot, board = apex_ompl.load_robot("panda"), Board(columns=5, rows=4, square=0.03)
+    camera = Camera(width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5), depth=DepthErrors(noise=0.003))
+    palm = robot.link_pose(robot.home, "panda_hand")
+    eye = look_at(palm[:3, 3] + [0.8, 0.3, 0.4], palm[:3, 3])
+    on_palm = np.linalg.inv(palm) @ np.block([[eye[:3, :3], palm[:3, 3:]], [np.zeros(3), 1.0]])
+    rng, views = np.random.default_rng(0), []
+    for _ in range(12):
+        q = robot.within_limits(robot.home + rng.normal(0.0, 0.3, robot.dof))
+        seen = np.linalg.inv(eye) @ robot.link_pose(q, "panda_hand") @ on_palm
+        points = board.corners @ seen[:3, :3].T + seen[:3, 3]
+        assert camera.projection_jacobian(points).shape == (20, 2, 3)
+        views.append(View(q, camera.project(points)))
+    found = calibrate(robot, camera, board, views, board_link="panda_hand")
+    assert np.abs(found.camera.pose_at(robot, robot.home) - eye).max() < 1e-3
+    assert found.corrected({"a": 1.0}) == {"a": 1.0}
+    assert measured_depths(found, robot, board, [], board_link="panda_hand") is None
+    assert board.find(np.full((480, 640, 3), 128, np.uint8)) is None
+    found.camera.save("found.yaml")
+    assert Camera.load("found.yaml") == found.camera and np.abs(camera.rays([319.5, 239.5])).max() < 1e-12
+    frame = Frame(camera, np.ones((480, 640)), joints=dict(zip(robot.joint_names, robot.home.tolist(), strict=True)))
+    frame.save("frame.npz")
+    assert np.array_equal(load_frames("frame.npz")[0].state(robot.joint_names), robot.home)
+    assert camera.points(Frame.load("frame.npz").depth).shape == (*camera.grid.shape[:2], 3)
+    _use_map(camera.placed(eye))
+    _use_messages(camera)
+    _use_twin_camera(camera.placed(eye))
+
+
+def _use_map(camera: Any) -> None:
+    """Occupied and unknown space before a wall; docs/perception.md has the rest."""
+    from apex_ompl.perception import OccupancyMap
+
+    pose = camera.pose
+    middle = pose[:3, 3] + 0.8 * pose[:3, 2]
+    seen = OccupancyMap((middle - 0.2, middle + 0.2), 0.02)
+    seen.integrate(np.full((480, 640), 0.8), camera)
+    before = pose[:3, 3] + 0.7 * pose[:3, 2]
+    assert seen.free.any() and seen.look_up([before]).tolist() == [-1] and len(seen.points()) == seen.occupied.sum()
+    seen.decay(127)
+    assert not seen.occupied.any()
+    seen.clear()
+    assert seen.unknown.all()
+
+
+def _use_messages(camera: Any) -> None:
+    """Messages that have the fields of those of ROS 2, and a bag without images."""
+    from types import SimpleNamespace as Message
+
+    from apex_ompl.errors import DriverError, MissingFileError, UnknownNameError
+    from apex_ompl.perception import Ros2Camera, Synchronizer, bag_frames
+
+    header = Message(stamp=Message(sec=1, nanosec=0))
+    image = {"header": header, "height": 480, "width": 640, "is_bigendian": 0}
+    together = Synchronizer()
+    together.states(Message(header=header, name=["a"], position=[0.5]))
+    together.color(Message(**image, encoding="mono8", step=640, data=bytes(640 * 480)))
+    together.depth(Message(**image, encoding="16UC1", step=1280, data=bytes(2 * 640 * 480)))
+    whole = Message(x_offset=0, y_offset=0)
+    matrix = [465.0, 0.0, 319.5, 0.0, 465.0, 239.5, 0.0, 0.0, 1.0]
+    about = Message(height=480, width=640, distortion_model="", d=[], k=matrix, roi=whole, binning_x=0, binning_y=0)
+    together.info(about)
+    (frame,) = together.ready()
+    assert frame.camera.focal == camera.focal and frame.joints == {"a": 0.5}
+    try:
+        next(bag_frames("bag"))
+    except UnknownNameError as error:
+        assert "/joint_states" in str(error)
+    node = Message(create_subscription=lambda *given: given, destroy_subscription=lambda one: None)
+    try:
+        over_ros = Ros2Camera(node, camera)
+    except MissingFileError:
+        return
+    assert not over_ros.frames() and not over_ros.dropped
+    try:
+        over_ros.next(0.01)
+    except DriverError as error:
+        assert "no images" in str(error)
+    over_ros.close()
+
+
+def _use_twin_camera(camera: Any) -> None:
+    """A camera in physics, where there is OpenGL."""
+    import apex_ompl
+    from apex_ompl.drivers import MujocoDriver
+    from apex_ompl.errors import MissingFileError
+    from apex_ompl.perception import TwinCamera
+
+    twin_camera = TwinCamera(MujocoDriver(apex_ompl.load_robot("panda")), camera)
+    try:
+        assert twin_camera.frame().depth.any() and len(list(twin_camera.frames(0.1, 10.0))) == 2
+    except MissingFileError as error:
+        assert "OpenGL" in str(error) and twin_camera.frames(0.1, 10.0)
+    twin_camera.close()

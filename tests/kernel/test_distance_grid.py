@@ -78,7 +78,7 @@ def surface_distance(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return found
 
 
-@settings(max_examples=25)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), size=st.floats(0.02, 0.5))
 def test_a_grid_of_triangles_is_a_near_lower_bound(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
@@ -140,7 +140,7 @@ def test_balls_are_apart_from_points_as_by_brute_force(seed: int, count: int, ra
     assert (bounds <= true + 1e-9).all()
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10**6), rows=st.integers(4, 20), waves=st.floats(0.0, 0.4))
 def test_balls_are_apart_from_a_solid_as_by_brute_force(seed: int, rows: int, waves: float) -> None:
     rng = np.random.default_rng(seed)

@@ -260,7 +260,7 @@ def test_what_is_no_number_is_never_proved(robot: Robot) -> None:
 def test_threads_do_not_disturb_each_other(robot: Robot, post: Obstacle) -> None:
     kernel = CollisionChecker(robot, [post]).kernel
     rng = np.random.default_rng(2)
-    batches = [states_around_home(robot, rng, 4000) for _ in range(4)]
+    batches = [states_around_home(robot, rng, 1500) for _ in range(4)]
     expected = [kernel.clearance(batch) for batch in batches]
     found: list[np.ndarray | None] = [None] * 4
 

@@ -218,6 +218,7 @@ def check_parts(tables: RobotTables, states: np.ndarray) -> None:
                 assert (away + a.node_outer[root] <= a.part_outer[p, bins]).all()
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 10**6))
 def test_parts_of_clusters_are_inside_of_their_balls(seed: int) -> None:
     tables, *_ = random_hand(seed)

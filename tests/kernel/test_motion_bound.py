@@ -93,7 +93,7 @@ def check(tables: RobotTables, middle: np.ndarray, step: np.ndarray, deviation: 
     return tightest
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10**6), size=st.floats(1e-3, 1.0), curved=st.floats(0.0, 0.3))
 def test_spheres_of_random_trees_stay_within_their_bounds(seed: int, size: float, curved: float) -> None:
     tables, *_ = random_robot(seed)

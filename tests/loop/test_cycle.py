@@ -237,7 +237,8 @@ def test_an_interrupt_stops_the_robot_and_returns_what_was_done_so_far(
 def test_assumptions_are_those_of_the_world_and_the_sensor_unless_they_are_given() -> None:
     world = worlds.load("vertical/moving-large-0.2/800001")
     for settings, assumed in (
-        (None, (0.03, 0.2)), (LoopSettings(timeout=0.5), (0.03, 0.2)), (LoopSettings(fastest=0.7), (0.03, 0.7)),
+        (None, (0.03, 0.2)), (LoopSettings(timeout=0.5), (0.03, 0.2)),
+        (LoopSettings(fastest=0.7, timeout=0.5), (0.03, 0.7)),
         (LoopSettings(error=0.1, timeout=0.5), (0.1, 0.2)),
     ):  # fmt: skip
         found = run(world.name, "blind", settings=settings, sensor=Sensor(noise=0.01)).settings["loop"]

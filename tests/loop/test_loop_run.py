@@ -55,7 +55,7 @@ def test_runs_in_all_worlds_are_results(kind: str, tmp_path: Path) -> None:
         assert (np.abs(goals - motion.positions[-1]).max(axis=1) < 1e-9).any()
 
 
-@pytest.mark.parametrize("timeout", [2.0, 2.95, 3.0])
+@pytest.mark.parametrize("timeout", [2.0, 2.95])
 def test_a_goal_that_is_blocked_for_good_ends_the_run_at_rest_and_names_the_obstacle(timeout: float) -> None:
     """A box comes to where a hand would be at the goal, and stays there."""
     problem = problems.load(PROBLEM).still
@@ -120,9 +120,9 @@ def test_parameters_outside_their_ranges_are_named(given: dict[str, Any]) -> Non
         LoopSettings(**given)
 
 
-@pytest.mark.parametrize("name", ["vertical/moving-medium-0.4/800005", "vertical/moving-huge-0.4/800007"])
-def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out(name: str) -> None:
+def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out() -> None:
     """A cube comes to where the robot stands within 0.2 s: too soon for a motion that is proved."""
+    name = "vertical/moving-huge-0.4/800007"
     found = run(name, "no-network", seed=0, settings=LoopSettings(evade="risk"))
     first = next(event for event in found.events if event.kind == "accepted")
     assert first.data["part"] == "evade" and first.data["leaving"] and found.metrics["unguarded_steps"] > 0.0

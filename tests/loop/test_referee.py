@@ -67,7 +67,7 @@ def dynamic_obstacle_of(robot: Robot, motion: Trajectory, rng: np.random.Generat
     return Obstacle.model_validate(fields)
 
 
-@settings(max_examples=14)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_first_contact_is_that_of_dense_samples(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)

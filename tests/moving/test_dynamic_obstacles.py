@@ -46,7 +46,7 @@ def dynamic_obstacle_near(
     return Obstacle.model_validate({"name": name, "position": at.tolist(), "velocity": velocity.tolist(), **shape})
 
 
-@settings(max_examples=18)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_motion_is_free_up_to_the_first_moment_that_is_not_proved(
     robot: Robot, bare: CollisionChecker, seed: int

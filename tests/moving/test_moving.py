@@ -21,7 +21,7 @@ SHAPES = [
 ]  # fmt: skip
 
 
-@settings(max_examples=20)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_valid_paths_are_free_at_all_times_and_invalid_ones_nearly_touch(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -155,7 +155,7 @@ def test_several_goals_never_hang(planner: str, problem: Problem, tmp_path: Path
     other = dict(problem.goal.joints[0], right_joint1=0.3)
     problem.model_copy(update={"goal": Goal(joints=(*problem.goal.joints, other))}).save(tmp_path / "p.yaml")
     command = [sys.executable, "-m", "apex_ompl.cli", "plan", tmp_path / "p.yaml", "--planner", planner]
-    done = subprocess.run([*command, "--timeout", "2"], check=False, capture_output=True, text=True, timeout=30)
+    done = subprocess.run([*command, "--timeout", "1"], check=False, capture_output=True, text=True, timeout=30)
     assert done.returncode in (0, 1, 4), done.stderr
     if planner.startswith("prm"):
         assert "takes one goal: the nearest of 2" in done.stdout

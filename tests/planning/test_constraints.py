@@ -17,7 +17,7 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.constraints import OnPlane, Upright
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.scripts import problem_at
+from apex_ompl.scene.scripts import obstacle_at, problem_at
 from apex_ompl.types import Array
 
 HANDS = "left_hand_palm", "right_hand_palm"
@@ -104,9 +104,11 @@ def test_the_tray_waits_for_what_crosses_its_way(carried: PlanResult) -> None:
     assert not np.array_equal(result.trajectory.times, motion.times), "or the ball is not in the way"
     first, second = (placement(motion.positions[0], hand) for hand in HANDS)
     wanted = first.actInv(second)
+    checker = CollisionChecker(robot(), problem_at(crossed, 0.0).scene, problem.attached)
     for time in np.linspace(0.0, result.trajectory.duration, 300):
         q = result.trajectory(time)
-        assert CollisionChecker(robot(), problem_at(crossed, float(time)).scene, problem.attached).is_free(q)
+        checker.move("ball", obstacle_at(ball, float(time)).position)
+        assert checker.is_free(q)
         found = placement(q, HANDS[0]).actInv(placement(q, HANDS[1]))
         off = np.linalg.norm(found.translation - wanted.translation)
         assert off <= result.constraint_bound["closed chain of tray"] <= 1e-3

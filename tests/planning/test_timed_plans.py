@@ -104,22 +104,22 @@ def test_what_is_no_timing_is_refused() -> None:
 
 def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.CaptureFixture[str]) -> None:  # type: ignore[no-untyped-def]
     out = tmp_path / "m.traj.yaml"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--velocity-scale", "0.5", "--out", str(out)]) == 0
+    assert cli.main(["plan", "shelf_swap", "--timeout", "20", "--velocity-scale", "0.5", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     motion = Trajectory.load(out)
     assert f"motion     {motion.duration:.3f} s" in printed and "jerk" in printed and "timing proof" in printed
     assert "mm clear" in printed and "proved by spheres" in printed
     out = tmp_path / "c.traj.json"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
+    assert cli.main(["plan", "shelf_swap", "--timeout", "20", "--out", str(out), "--controllers"]) == 0
     assert Trajectory.load(out).dof == 16 and "left_arm_controller" in out.read_text()
     out = tmp_path / "s.csv"
     part = ["--rate", "500", "--joints", "right_arm,left_hand_synergy"]
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out), *part]) == 0
+    assert cli.main(["plan", "shelf_swap", "--timeout", "20", "--out", str(out), *part]) == 0
     sampled = Trajectory.load(out)
     assert sampled.joint_names == (*(f"right_joint{k}" for k in range(1, 8)), "left_hand_synergy")
     np.testing.assert_allclose(np.diff(sampled.times)[:-1], 0.002, atol=1.1e-9)
     out = tmp_path / "r.npz"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--out", str(out)]) == 0
+    assert cli.main(["plan", "shelf_swap", "--timeout", "20", "--out", str(out)]) == 0
     saved = PlanResult.load(out)
     assert saved.trajectory is not None and saved.limit_use["jerk"] > 0.0
     assert saved.motion_clearance > 0.0
@@ -128,21 +128,21 @@ def test_the_command_writes_motions_and_draws_them(tmp_path, capsys: pytest.Capt
     assert (tmp_path / "p.png").read_bytes()[:4] == b"\x89PNG" and "<svg" in (tmp_path / "p.svg").read_text()
     capsys.readouterr()
     untimed = tmp_path / "n.npz"
-    assert cli.main(["plan", "ball_in_cup", "--timeout", "20", "--no-timing", "--out", str(untimed)]) == 0
+    assert cli.main(["plan", "shelf_swap", "--timeout", "20", "--no-timing", "--out", str(untimed)]) == 0
     without = PlanResult.load(untimed)
     assert without.trajectory is None and np.isnan(without.motion_clearance)
     for arguments, words in (
         (["plot", str(untimed), "-o", str(tmp_path / "q.png")], "timed motion"),
         (["plot", str(out), "-o", str(tmp_path / "q.txt")], "ending in"),
         (["plot", str(tmp_path / "none.npz"), "-o", str(tmp_path / "q.png")], "none.npz"),
-        (["plan", "ball_in_cup", "--jerk-scale", "2"], "jerk_scale"),
-        (["plan", "ball_in_cup", "--controllers"], "--controllers"),
-        (["plan", "ball_in_cup", "--rate", "100"], "--rate"),
-        (["plan", "ball_in_cup", "--rate", "0", "--out", str(tmp_path / "q.csv")], "--rate"),
-        (["plan", "ball_in_cup", "--joints", "left_arm", "--out", str(tmp_path / "q.npz")], "--joints"),
-        (["plan", "ball_in_cup", "--joints", "left_foot", "--out", str(tmp_path / "q.csv")], "joint 'left_foot'"),
-        (["plan", "ball_in_cup", "--rate", "5", "--out", str(tmp_path / "q.csv")], "Hz, at which this motion keeps"),
-        (["plan", "ball_in_cup", "--no-timing", "--out", str(tmp_path / "q.traj.yaml")], "--no-timing"),
+        (["plan", "shelf_swap", "--jerk-scale", "2"], "jerk_scale"),
+        (["plan", "shelf_swap", "--controllers"], "--controllers"),
+        (["plan", "shelf_swap", "--rate", "100"], "--rate"),
+        (["plan", "shelf_swap", "--rate", "0", "--out", str(tmp_path / "q.csv")], "--rate"),
+        (["plan", "shelf_swap", "--joints", "left_arm", "--out", str(tmp_path / "q.npz")], "--joints"),
+        (["plan", "shelf_swap", "--joints", "left_foot", "--out", str(tmp_path / "q.csv")], "joint 'left_foot'"),
+        (["plan", "shelf_swap", "--rate", "5", "--out", str(tmp_path / "q.csv")], "Hz, at which this motion keeps"),
+        (["plan", "shelf_swap", "--no-timing", "--out", str(tmp_path / "q.traj.yaml")], "--no-timing"),
     ):
         capsys.readouterr()
         assert cli.main(arguments) == 2

@@ -76,7 +76,7 @@ def test_windows_shells_tubes_and_curves_are_where_they_are_said_to_be() -> None
 def test_meshes_and_points_agree_with_the_parts_that_they_are_made_from() -> None:
     parts = [*some_parts(9), *broad_parts.ball(0.25), *broad_parts.rod((0.0, 0.0, 0.0), (0.1, 0.2, 0.4), 0.04)]
     rng = np.random.default_rng(3)
-    around = rng.uniform(-0.8, 0.8, (300, 3))
+    around = rng.uniform(-0.8, 0.8, (120, 3))
     away = around[nearest(parts, around) > 0.01]
     for is_open in (False, True):
         vertices, faces = mesh(parts, is_open=is_open)

@@ -254,7 +254,7 @@ def test_popups_appear_before_a_hand_and_clear_of_the_robot(suite: str, size: st
 
 def test_most_popups_are_in_the_way() -> None:
     met = []
-    for name in worlds.ids("popup", "train", 20):
+    for name in worlds.ids("popup", "train", 10):
         world = worlds.load(name)
         motion = first_motion(world)
         seen = run(world, motion, motion.duration + BEGIN, 0.05)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from apex_ompl.ros2.frames import Frames  # noqa: E402
 from apex_ompl.ros2.library import ros2  # noqa: E402
 from apex_ompl.ros2.messages import Drawing, cloud_points, marker_name, obstacles_of, thinned  # noqa: E402
 from apex_ompl.ros2.parameters import NodeSettings, joints_by_controller  # noqa: E402
+from apex_ompl.ros2.scene import Inbox  # noqa: E402
 
 client_of = benchmark_script("physics.ros2_client")
 TURN = pose_matrix((1.0, 2.0, 3.0), (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)))  # by a right angle about z
@@ -64,6 +66,15 @@ def test_faulty_clouds_are_refused() -> None:
         change(cloud)
         with pytest.raises(ParameterError, match=why):
             cloud_points(cloud)
+
+
+def test_a_camera_is_at_work_where_two_clouds_came() -> None:
+    inbox = Inbox()
+    for received, message, works in ((10, "first", False), (20, "second", True), (40, "third", False)):
+        inbox.put(partial(inbox.add_cloud, received, message))
+        assert inbox.clouds_come(since=received - 15) is works
+    inbox.wait_for_cloud(0.0)
+    assert inbox.take_cloud() == (40, "third") and inbox.take_cloud() is None and not inbox.waits()
 
 
 def test_each_point_is_in_a_cell() -> None:

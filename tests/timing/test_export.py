@@ -53,7 +53,7 @@ savings = st.builds(
 )  # fmt: skip
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=24, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(path=paths(), timing=st.sampled_from([Timing(), Timing("spline"), Timing(minimum_duration=5.0)]), saving=savings)
 def test_controllers_that_follow_files_keep_the_limits(
     tmp_path: Path, path: np.ndarray, timing: Timing, saving: Saving

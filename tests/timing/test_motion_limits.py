@@ -59,7 +59,7 @@ def test_shares_are_those_of_dense_samples(robot: Robot, states: int, seed: int)
     assert use["tool_speed"] == pytest.approx(max(speeds) / 0.5, rel=1e-3)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 99), payload=st.sampled_from([1.0, 2.0, 2.5]), speed=st.sampled_from([None, 0.25, 1.0]))
 def test_the_stretch_is_the_least_that_keeps_the_limits(seed: int, payload: float, speed: float | None) -> None:
     robot = load_robot("dual_panda_softhand")
@@ -91,7 +91,7 @@ def test_motions_keep_the_limits_and_lose_less_time_than_by_slowing_down(
     limits = timing.motion_limits(robot)
     assert limits is not None
     gained = []
-    for seed in range(3):
+    for seed in range(2):
         path = random_path(robot, seed)
         plain, made = (timed(robot, path, timing, some).trajectory for some in (None, limits))
         assert largest_torque(limits, made) <= BETWEEN

@@ -117,7 +117,7 @@ def test_half_precision_stays_inside_the_limits() -> None:
     assert np.array_equal(half, half.astype(np.float16)) and np.abs(half - control).max() < 4e-3
 
 
-SMALL = ("vertical/small", "wall/easy", "broad/free", "--problems", 48, "--parts", 1, "--quiet")
+SMALL = ("vertical/small", "wall/easy", "broad/free", "--problems", 24, "--parts", 1, "--quiet")
 
 
 def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(tmp_path: Path, script_here: Any) -> None:
@@ -200,9 +200,9 @@ def test_workers_of_ray_make_the_same_paths_and_may_die(made: list[Paths]) -> No
     except Exception as error:  # sandboxes without sockets or shared memory
         pytest.skip(f"Ray does not start here: {error}")
     try:
-        units = {unit.name: (unit, EngineOptions(), Spline()) for unit in UNITS}
+        units = {unit.name: (unit, EngineOptions(), Spline()) for unit in UNITS[1:3]}
         found = {name: paths for name, (paths, _) in spread(solve_unit, units, **options)}
-        assert all(same(found[unit.name], paths) for unit, paths in zip(UNITS, made, strict=True))
+        assert all(same(found[unit.name], paths) for unit, paths in zip(UNITS[1:3], made[1:3], strict=True))
 
         def fails(unit: int) -> int:
             if unit == 1:

@@ -95,7 +95,7 @@ def test_estimates_of_a_model_that_pays_for_collisions_have_fewer(few: Path, tmp
     for weight in (0.0, 3.0):
         folder = tmp_path / f"{weight:g}"
         folder.mkdir()
-        trainer = Trainer(config(few, condition=CLEARANCES, steps=100, rate=3e-3, collision=weight), folder, HERE)
+        trainer = Trainer(config(few, condition=CLEARANCES, steps=70, rate=3e-3, collision=weight), folder, HERE)
         trainer.run()
         data, generator, network = trainer.data, torch.Generator().manual_seed(0), trainer.averaged_network()
         control, conditions = data.shard.batch(np.arange(len(data.shard)), generator)

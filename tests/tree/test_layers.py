@@ -13,7 +13,7 @@ From the top, as CONTRIBUTING has it:
    generation.
 6. `apex`: the planner APEX, its parameters, the stages of `solve`, their context and report.
 7. `moving`: dynamic obstacles in time and what replanners share; `ompl`: state space, validity checkers, set-up for
-   OMPL; `drivers`: robots that follow motions.
+   OMPL; `drivers`: robots that follow motions; `perception`: cameras, and what they see.
 8. `goals`: alignments, poses, grasps, inverse kinematics; `timing`: motions over time; `model`: inference without
    torch.
 9. `constraints`: what holds along a path; `collision`: the checker, spheres before meshes; `paths`: splines, the
@@ -41,6 +41,7 @@ LAYERS = [
     {"constraints"},
     {"goals", "timing", "model"},
     {"drivers"},
+    {"perception"},
     {"ompl"},
     {"moving"},
     {"apex"},

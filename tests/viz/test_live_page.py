@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 from planning import cached_problem
+from small_arm import arm_problem
 
+from apex_ompl import plan
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
@@ -23,15 +26,27 @@ from apex_ompl.viz.view import view
 from apex_ompl.viz.viewer.live_page import LivePage
 from apex_ompl.viz.viewer.run import ShownRun
 from apex_ompl.viz.viewer.scene import BrowserScene, pose_of
+from apex_ompl.viz.viewer.server import serving
 from apex_ompl.viz.viewer.shown import Shown
 
 RED = (0xE0, 0x10, 0x1B)  # of contacts
 LARGEST = 6e6  # of a page [bytes]
 
 
-def test_dragging_says_what_is_free(server: Any) -> None:
-    problem = cached_problem("posts/medium/900003")
-    page = LivePage(server, [Shown.of(problem)])
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> PlanResult:
+    """A plan of an arm that is drawn in no time."""
+    return plan(arm_problem(tmp_path_factory.mktemp("arm")), timeout=20.0)
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[LivePage]:
+    """A page of a problem of the two arms, on a server of its own."""
+    with serving() as server:
+        yield LivePage(server, [Shown.of(cached_problem("posts/medium/900003"))])
+
+
+def test_dragging_says_what_is_free(page: LivePage) -> None:
     editor = page.editor
     assert editor is not None and "free" in editor._state.content
     name = editor.add_box()
@@ -44,7 +59,7 @@ def test_dragging_says_what_is_free(server: Any) -> None:
     page.step(0.0)
     assert "left" in editor._state.content and "box" in editor._state.content
     assert tuple(page.player.scenes[0].obstacles[name].color) == RED
-    names = server.scene._handle_from_node_name
+    names = page._server.scene._handle_from_node_name
     assert "/1/why start" in names
     editor.drag(pose_of((1, 0, 0, 0), (0.9, 0.9, 1.2)))
     assert "start free" in editor._state.content
@@ -131,8 +146,7 @@ def test_what_was_asked_of_controls_that_are_gone_is_not_done(server: Any, resul
     assert not page.inspection._nodes, "its nodes went with the scene"
 
 
-def test_proposals_and_their_denoising_are_drawn(server: Any) -> None:
-    page = LivePage(server, [Shown.of(cached_problem("posts/medium/900003"))])
+def test_proposals_and_their_denoising_are_drawn(page: LivePage) -> None:
     assert page.inspection is not None
     page.inspection.draw()
     assert re.match(r"8 proposals: \d free as they are, \d after", page.inspection._said.content)
@@ -180,8 +194,8 @@ def test_layers_of_a_run_show_what_was_fed_last(server: Any, problem: Problem, t
     assert (tmp_path / "run.html").stat().st_size < LARGEST
 
 
-def test_a_run_that_goes_on_is_followed(server: Any, problem: Problem) -> None:
-    run = ShownRun("a run", assemble(problem))
+def test_a_run_that_goes_on_is_followed(server: Any, small: PlanResult) -> None:
+    run = ShownRun("a run", assemble(small.problem))
     page = LivePage(server, [run])
     assert page.editor is None and not page.player._slider.visible
     states = np.linspace(run.setup.start, run.setup.goals[0], 300)
@@ -205,7 +219,8 @@ def test_a_run_that_goes_on_is_followed(server: Any, problem: Problem) -> None:
     assert page.player.time < 0.2
 
 
-def test_the_player_plays_to_the_end_and_begins_anew(server: Any, result: PlanResult) -> None:
+def test_the_player_plays_to_the_end_and_begins_anew(server: Any, small: PlanResult) -> None:
+    result = small
     page = LivePage(server, [Shown.of(result)])
     page.step(0.5)
     assert page.player.time == pytest.approx(0.5) and page.player._slider.value == pytest.approx(0.5)
@@ -227,10 +242,10 @@ def test_the_player_plays_to_the_end_and_begins_anew(server: Any, result: PlanRe
     assert page.player.time == pytest.approx(0.3) and not page.player._play.value
 
 
-def test_of_a_folder_one_result_is_chosen_at_a_time(server: Any, result: PlanResult, tmp_path: Path) -> None:
+def test_of_a_folder_one_result_is_chosen_at_a_time(server: Any, small: PlanResult, tmp_path: Path) -> None:
     files = [tmp_path / f"{k}.npz" for k in range(2)]
-    result.save(files[0])
-    replace(result, planner="another").save(files[1])
+    small.save(files[0])
+    replace(small, planner="another").save(files[1])
     page = LivePage(server, [], saved_in(tmp_path))
     assert "another" not in page.player._facts.content
     page.choose(files[1].as_posix())

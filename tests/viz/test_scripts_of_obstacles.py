@@ -146,7 +146,7 @@ def test_faults_of_scripts_are_named(fields: dict[str, Any], words: str) -> None
         Problem.parse({**data, "scene": [{**BOX, **fields}]}, "p.yaml")
 
 
-@settings(max_examples=15)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_timed_paths_among_scripts_are_free_at_all_times_or_nearly_touch(robot: Robot, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from small_arm import arm_problem
 
-from apex_ompl import load_problem, plan
+from apex_ompl import load_problem
 from apex_ompl.cli import main
 from apex_ompl.collision.tables import joint_tree
 from apex_ompl.errors import MissingFileError, ParameterError, RobotError
@@ -20,7 +21,6 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.problem import Problem
 from apex_ompl.viz.appearance import items_of
 from apex_ompl.viz.sources import saved_in
 from apex_ompl.viz.view import view
@@ -79,21 +79,20 @@ def test_the_drawn_cover_is_that_of_the_kernel(robot: Robot) -> None:
         np.testing.assert_array_equal(rows[:, 3], tables.node_radius[mine])
 
 
-@pytest.mark.parametrize("name", ["ball_in_cup", "shelf/hard/900012"])
-def test_pages_are_one_small_file_that_needs_no_network(name: str, tmp_path: Path) -> None:
-    found = plan(name, timeout=20.0)
-    write_page([Shown.of(found)], tmp_path / "p.html", cover=True)
+def test_pages_are_one_small_file_that_needs_no_network(result: PlanResult, tmp_path: Path) -> None:
+    write_page([Shown.of(result)], tmp_path / "p.html", cover=True)
     text = (tmp_path / "p.html").read_text()
     assert (tmp_path / "p.html").stat().st_size < LARGEST
     assert not re.search(r"""<(script|link|img|iframe)[^>]*(src|href)=["']?(https?:)?//""", text)
-    assert f"{found.length:.2f} rad" in text and "share of limit" in text
+    assert f"{result.length:.2f} rad" in text and "share of limit" in text
 
 
 def test_several_results_and_a_problem_with_a_fault_stand_side_by_side(
-    server: Any, problem: Problem, result: PlanResult, tmp_path: Path
+    server: Any, result: PlanResult, tmp_path: Path
 ) -> None:
+    problem = arm_problem(tmp_path)
     blocked = problem.model_copy(update={"goal": problem.goal.model_copy(update={"joints": (problem.start,)})})
-    post = Obstacle(name="inside", sphere={"radius": 0.3}, position=(0.3, 0.4, 0.5))
+    post = Obstacle(name="inside", sphere={"radius": 0.1}, position=(0.1, -0.1, 0.7))
     blocked = blocked.model_copy(update={"scene": (post,)})
     shown = [Shown.of(result), Shown.of(blocked)]
     assert any(row.startswith("start: ") and "inside" in row for row in shown[1].facts)
@@ -107,11 +106,11 @@ def test_several_results_and_a_problem_with_a_fault_stand_side_by_side(
     assert "inside" in (tmp_path / "two.html").read_text()
 
 
-def test_names_that_are_nearly_equal_are_different_nodes(server: Any, problem: Problem) -> None:
+def test_names_that_are_nearly_equal_are_different_nodes(server: Any, tmp_path: Path) -> None:
     bodies = [
         Obstacle(name=name, sphere={"radius": 0.1}, position=(3.0, 0.0, k)) for k, name in enumerate(("a/b", "a_b"))
     ]
-    page = LivePage(server, [Shown.of(problem.model_copy(update={"scene": tuple(bodies)}))])
+    page = LivePage(server, [Shown.of(arm_problem(tmp_path).model_copy(update={"scene": tuple(bodies)}))])
     found = page.player.scenes[0].obstacles
     assert [float(found[name].position[2]) for name in ("a/b", "a_b")] == [0.0, 1.0]
 
@@ -131,10 +130,10 @@ def test_pages_are_served_to_this_machine_alone(server: Any) -> None:
     assert server.get_host() == "127.0.0.1"
 
 
-def test_without_a_browser_the_address_is_given(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_browser_the_address_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("webbrowser.open", lambda address: False)
     said: list[str] = []
-    view(problem, ready=said.append, until=lambda: True)
+    view(arm_problem(tmp_path), ready=said.append, until=lambda: True)
     assert said[0].startswith("http://127.0.0.1:") and "no browser was found" in said[1]
 
 

@@ -349,9 +349,24 @@ OTHERS: Functions = {
         + "f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1]",
         6,
     ),
+    "perception.voxels.block_depths": ("f4[::1], i8[::1], i1[::1], f8, f8, f8, f4[:, :, ::1]", 1),
+    "perception.voxels.mark_inside": (
+        "f4[::1], f4[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], i1[::1]",
+        1,
+    ),
+    "perception.voxels.fill_voxels": (
+        "i1[:, :, ::1], i1[:, :, ::1], f4[::1], f4[:, ::1], i1[::1], f8, f8, f8[:, ::1], f8[::1], "
+        + "f8, f8, f8, f8, f8, i8, i8",
+        1,
+    ),
+    "perception.voxels.clear_voxels": (
+        "i1[:, :, ::1], i1[:, :, ::1], f4[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8, " + 7 * "f8, ",
+        2,
+    ),
+    "perception.voxels.mark_near": ("i1[:, :, ::1], f8[:, ::1], f8[::1], f8", 1),
     "geometry.triangles.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }
-"""What point clouds, grids, inverse kinematics, roadmaps and trainings call; without the library, compiled at need."""
+"""What clouds, grids, depth images, inverse kinematics, roadmaps and trainings call; else compiled at need."""
 
 ALL: Functions = {**PLANS.functions, **RUNS.functions, **CONSTRAINED.functions, **OTHERS}
 """All functions that Python calls."""

@@ -1,0 +1,1 @@
+"""Depth images: pixels in blocks, voxels looked up in them."""

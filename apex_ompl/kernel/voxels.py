@@ -1,0 +1,195 @@
+"""Voxels that depth images show to be free or occupied, over flat arrays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import numpy as np
+
+from apex_ompl.kernel.compiled.layout import Bytes, Integers, Singles
+from apex_ompl.kernel.compiled.perception import voxels
+from apex_ompl.types import Array
+from apex_ompl.util.arrays import compact
+
+SPREAD = 2.507  # extent of a normal distribution whose density is that of its middle [standard deviations]
+LEAST_NOISE = 1e-9
+FREE, UNKNOWN = voxels.FREE, voxels.UNKNOWN  # evidence of voxels; larger numbers are those of occupied ones
+
+
+class ImageBlocks(NamedTuple):
+    """The pixels of a camera in the order of square blocks of the plane z = 1 m of the optical frame.
+
+    Attributes:
+        order: Numbers of the pixels, row by row, in the order of blocks, shape (P,).
+        rays: Their points of the plane, shape (P, 2) [m].
+        first: First pixel of each block, and P, shape (rows columns + 1,).
+        whole: Whether the image holds the block as a whole, shape (rows columns,).
+        plane: Corner of the first block, and sides of a block, shape (2, 2) [m].
+        shape: Rows and columns of blocks.
+        density: Pixels of a unit of the plane [1/m^2].
+    """
+
+    order: Integers
+    rays: Singles
+    first: Integers
+    whole: Bytes
+    plane: Array
+    shape: tuple[int, int]
+    density: float
+
+    @classmethod
+    def of(cls, rays: Array, focal: tuple[float, float], size: int) -> Self:
+        """Return the blocks of an image.
+
+        Args:
+            rays: Points of the plane that the pixels see, shape (height, width, 2) [m].
+            focal: Focal lengths [pixels].
+            size: Side of a block [pixels].
+        """
+        height, width = rays.shape[:2]
+        pixel = 1.0 / np.asarray(focal, float)
+        flat = rays.reshape(-1, 2)
+        low, side = flat.min(axis=0) - 0.5 * pixel, size * pixel
+        place = np.floor((flat - low) / side + 1e-9).astype(np.int64)
+        columns, rows = (place.max(axis=0) + 1).tolist()
+        block = place[:, 1] * columns + place[:, 0]
+        order = np.argsort(block, kind="stable").astype(np.int64)
+        counts = np.bincount(block, minlength=rows * columns)
+        border = np.zeros((height, width), bool)
+        border[[0, -1]] = border[:, [0, -1]] = True
+        cut = np.bincount(block[border.ravel()], minlength=rows * columns) > 0
+        whole = (counts > 0) & (~cut | (counts == size * size))
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        singles = np.ascontiguousarray(flat[order], np.float32)
+        plane, density = np.stack([low, side]), float(focal[0] * focal[1])
+        return cls(order, singles, first, whole.astype(np.int8), plane, (rows, columns), density)
+
+    def depths(self, image: Array) -> Singles:
+        """Return the depths of an image, shape (height, width), in the order of the pixels, shape (P,) [m]."""
+        return image.ravel()[self.order].astype(np.float32)
+
+
+class DepthWindows(NamedTuple):
+    """Least depths of windows of an image.
+
+    Attributes:
+        blocks: The blocks of the image.
+        near: Least depths of blocks, of 3x3 blocks around each, of 5x5 and so on, shape (levels, rows, columns) [m]; 0
+            where one of them is not known, or outside of the image.
+        nearest: Smallest depth that counts [m].
+        farthest: Depth up to which a larger one shows the space to be free [m].
+    """
+
+    blocks: ImageBlocks
+    near: Singles
+    nearest: float
+    farthest: float
+
+    @classmethod
+    def of(cls, blocks: ImageBlocks, image: Array, span: tuple[float, float], missing: float, levels: int) -> Self:
+        """Return the windows of an image.
+
+        Args:
+            blocks: The blocks of its camera.
+            image: Depths, 0 where there is none, shape (height, width) [m].
+            span: Smallest and largest depth that count [m].
+            missing: Largest share of pixels without a depth in a block that is known.
+            levels: Number of sizes of windows.
+        """
+        near = np.empty((levels, *blocks.shape), np.float32)
+        voxels.block_depths(blocks.depths(image), blocks.first, blocks.whole, *span, missing, near)
+        return cls(blocks, near, *span)
+
+
+class SeenPoints(NamedTuple):
+    """Points that an image shows.
+
+    Attributes:
+        rays: The points of the plane z = 1 m of the optical frame at which they are seen, shape (P, 2) [m].
+        depths: Their depths, 0 where there is none, shape (P,) [m].
+        left_out: 1 for points on the robot or on what it holds, shape (P,).
+        density: Points of a surface across the line of sight at a depth of 1 m [1/m^2].
+    """
+
+    rays: Singles
+    depths: Singles
+    left_out: Bytes
+    density: float
+
+    @classmethod
+    def of(cls, blocks: ImageBlocks, image: Array, spheres: Array) -> Self:
+        """Return the points of an image.
+
+        Args:
+            blocks: The blocks of its camera.
+            image: Depths, 0 where there is none, shape (height, width) [m].
+            spheres: Centers in the optical frame and radii of spheres whose points are left out, shape (S, 4) [m].
+        """
+        depths = blocks.depths(image)
+        inside = np.zeros(len(depths), np.int8)
+        voxels.mark_inside(depths, blocks.rays, blocks.first, blocks.plane, blocks.shape[1], compact(spheres), inside)
+        return cls(blocks.rays, depths, inside, blocks.density)
+
+
+class VoxelUpdate(NamedTuple):
+    """How an image changes the evidence of voxels.
+
+    Attributes:
+        origin: Outer corner of the first voxel, shape (3,) [m].
+        side: Side of a voxel [m].
+        pose: Pose of the optical frame, shape (4, 4) [m].
+        share: Share of the points that a surface leaves in a voxel which makes it occupied.
+        least: How many points are the least, where more are to be expected.
+        gain: What they add to its evidence.
+        most: Largest evidence.
+        noise: Standard deviation of a depth z is ``noise`` z^2 [1/m].
+        scale: Relative error of depths.
+        angle: Error of the orientation of the camera [rad].
+        shift: Error of its position [m].
+    """
+
+    origin: Array
+    side: float
+    pose: Array
+    share: float
+    least: int
+    gain: int
+    most: int
+    noise: float
+    scale: float
+    angle: float
+    shift: float
+
+    def apply(self, evidence: Bytes, windows: DepthWindows, points: SeenPoints) -> None:
+        """Change the evidence of voxels, shape (nx, ny, nz)."""
+        blocks, pose, hits = windows.blocks, compact(self.pose), np.zeros_like(evidence)
+        sharp = self.side / (SPREAD * max(self.noise, LEAST_NOISE))
+        voxels.fill_voxels(
+            evidence, hits, points.depths, points.rays, points.left_out, windows.nearest, windows.farthest, pose,
+            self.origin, self.side, points.density * self.side * self.side, sharp, self.share, float(self.least),
+            self.gain, self.most,
+        )  # fmt: skip
+        halves = 0.5 * self.side * np.abs(pose[:3, :3]).sum(axis=0)  # along the axes of the camera
+        corner, side = blocks.plane
+        widest = np.abs(np.stack([corner, corner + side * blocks.shape[::-1]])).max(axis=0)
+        radius = ((halves[:2] + widest * halves[2] + self.shift) / side).max()
+        voxels.clear_voxels(
+            evidence, hits, windows.near, blocks.plane, pose, self.origin, self.side,
+            windows.nearest + float(halves[2]), windows.farthest, 1.0 + self.scale + self.angle * float(widest.sum()),
+            float(halves[2]) + self.shift, float(halves[2]), float(radius),
+            float((self.angle * (1.0 + widest * widest) / side).max()),
+        )  # fmt: skip
+
+
+def mark_near(shape: tuple[int, int, int], origin: Array, side: float, spheres: Array) -> Bytes:
+    """Return which voxels have their centers inside of spheres.
+
+    Args:
+        shape: Numbers of voxels.
+        origin: Outer corner of the first voxel, shape (3,) [m].
+        side: Side of a voxel [m].
+        spheres: Centers and radii, shape (S, 4) [m].
+    """
+    found = np.zeros(shape, np.int8)
+    voxels.mark_near(found, compact(spheres), origin, side)
+    return found

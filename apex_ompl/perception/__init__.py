@@ -1,0 +1,42 @@
+"""Perception: cameras, their calibration, and frames with color and depth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from apex_ompl.util.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from apex_ompl.perception.bags import bag_frames as bag_frames
+    from apex_ompl.perception.boards import Board as Board
+    from apex_ompl.perception.camera import Camera as Camera
+    from apex_ompl.perception.camera import DepthErrors as DepthErrors
+    from apex_ompl.perception.camera import look_at as look_at
+    from apex_ompl.perception.depth_scale import measured_depths as measured_depths
+    from apex_ompl.perception.frames import Frame as Frame
+    from apex_ompl.perception.frames import load_frames as load_frames
+    from apex_ompl.perception.frames import save_sequence as save_sequence
+    from apex_ompl.perception.hand_eye import Calibration as Calibration
+    from apex_ompl.perception.hand_eye import View as View
+    from apex_ompl.perception.hand_eye import calibrate as calibrate
+    from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
+    from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
+    from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
+    from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
+    from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
+
+__all__, __getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "bags": "bag_frames",
+        "boards": "Board",
+        "camera": "Camera DepthErrors look_at",
+        "depth_scale": "measured_depths",
+        "frames": "Frame load_frames save_sequence",
+        "hand_eye": "Calibration View calibrate",
+        "occupancy": "OccupancyMap OccupancySettings",
+        "ros2_camera": "Ros2Camera",
+        "synchronizer": "Synchronizer",
+        "twin_camera": "TwinCamera",
+    },  # fmt: skip
+)

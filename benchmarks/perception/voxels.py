@@ -1,0 +1,306 @@
+"""Occupancy maps of test problems from noisy depth images: time, coverage, errors against the true scene, and plans.
+
+A robot at the start of a problem, with what it holds, stands in a room with walls. Cameras of 640 x 480 pixels look at
+it from three places 1.2 to 1.6 m in front; their assumed poses have errors with the standard deviations that they
+state. Images are rays of MuJoCo with the errors of a stereo camera (``benchmarks/perception/depth_rays.py``). "look-up"
+is ``apex_ompl.perception.OccupancyMap``; "rays" follows the ray of every fourth pixel, with the same hits and the same
+filter of the robot, and lowers the evidence of the voxels on its way once an image each.
+
+``ms`` is CPU time of one image on one core, with the filter of the robot. "covered" is the share of the surface seen
+without noise that has an occupied voxel within a voxel of it. "off" are occupied voxels that touch no solid, or are 3
+cm off. "freed" is the share of the voxels with their centers in a solid, the robot's among them, that are free.
+"sure" is the share of the voxels free by rays without errors that are free.
+
+Plans are made by the default planner in maps of 20 mm, from nine places all around, with a margin of 5 cm around the
+start; every state of the paths, 0.02 rad apart, is checked in the true scene by Coal alone.
+
+Usage: python -m benchmarks.perception.voxels [-n 8] [--plans 8]
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import pinocchio as pin
+from tqdm import tqdm
+
+from apex_ompl import plan, problems
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.cloud_contact import signed_distances
+from apex_ompl.collision.shapes import coal_geometry, world_geometry
+from apex_ompl.kernel.voxels import SeenPoints
+from apex_ompl.perception import Camera, OccupancyMap, look_at
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.entry_point import run_script
+from benchmarks.lib import record
+from benchmarks.perception.depth_rays import RayScene, measured
+
+DEPENDS = (
+    "@planning", "apex_ompl/perception/camera.py", "apex_ompl/perception/frames.py",
+    "apex_ompl/perception/occupancy.py", "benchmarks/perception/depth_rays.py",
+)  # fmt: skip
+CAMERA = Camera(
+    width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5), position_spread=0.002, angle_spread=0.0015
+)
+BOX = np.array([[-0.6, -1.2, -0.1], [1.8, 1.2, 1.5]])
+SIDES = (0.01, 0.02, 0.04)
+ROOM = (
+    Obstacle(name="back_wall", box=(0.1, 6.0, 4.0), position=(-1.3, 0.0, 0.5)),
+    Obstacle(name="front_wall", box=(0.1, 6.0, 4.0), position=(2.5, 0.0, 0.5)),
+    Obstacle(name="left_wall", box=(6.0, 0.1, 4.0), position=(0.0, 1.9, 0.5)),
+    Obstacle(name="right_wall", box=(6.0, 0.1, 4.0), position=(0.0, -1.9, 0.5)),
+    Obstacle(name="ground", box=(6.0, 6.0, 0.1), position=(0.0, 0.0, -0.8)),
+)
+FRONT, AROUND = (-0.7, 0.0, 0.7), tuple(np.arange(9) * 2.0 * np.pi / 9.0)
+PLANNED, MARGIN = 0.02, 0.05  # of maps that are planned in: side of a voxel, and margin of unknown space [m]
+SUITES = ("posts", "shelf", "clutter", "wall")
+OFF = 0.03  # [m]
+
+
+class Look(NamedTuple):
+    """An image: as it was measured and as it is, and the pose of the camera, assumed and true."""
+
+    depth: np.ndarray
+    true: np.ndarray
+    without_robot: np.ndarray
+    assumed: np.ndarray
+    pose: np.ndarray
+
+
+Solid = tuple[Any, np.ndarray]
+"""Geometry and pose in the world."""
+
+
+class Truth(NamedTuple):
+    """A scene: solids without the robot, centers of voxels in solids, points that are seen, and voxels free by rays.
+
+    The robot is one of the solids that voxels are in.
+    """
+
+    solids: list[Solid]
+    inside: np.ndarray
+    surface: np.ndarray
+    free: np.ndarray
+
+
+def looks(
+    made: Robot, problem: Problem, q: np.ndarray, rng: np.random.Generator, directions: tuple[float, ...]
+) -> list[Look]:
+    """Return the images of a problem's start from directions around z [rad]."""
+    full = RayScene(made, [*problem.scene, *ROOM], problem.attached)
+    found = []
+    for middle in directions:
+        around, above = middle + rng.uniform(-0.2, 0.2), rng.uniform(0.2, 0.9)
+        target = np.array([0.4, 0.0, 0.5]) + rng.normal(0.0, 0.05, 3)
+        away = np.array([np.cos(around) * np.cos(above), np.sin(around) * np.cos(above), np.sin(above)])
+        pose = look_at(target + rng.uniform(1.2, 1.6) * away, target)
+        error = pin.SE3(
+            pin.exp3(CAMERA.angle_spread * rng.normal(size=3)), CAMERA.position_spread * rng.normal(size=3)
+        ).homogeneous
+        true = full.depth(CAMERA, pose, q)
+        found.append(
+            Look(measured(true, CAMERA, rng), true, full.depth(CAMERA, pose, q, robot=False), pose @ error, pose)
+        )
+    return found
+
+
+@numba.njit
+def follow(evidence, hits, depth, left_out, rays, pose, origin, side):  # type: ignore[no-untyped-def] # noqa: ANN001, ANN201, PLR0917
+    """Lower the evidence of voxels on the ways of rays (Amanatides and Woo 1987), once an image; hits are done."""
+    nx, ny, nz = evidence.shape
+    passed = np.zeros(evidence.shape, np.bool_)
+    start = (pose[:3, 3] - origin) / side
+    for p in range(len(depth)):
+        z = depth[p]
+        if z <= 0.0:
+            continue
+        step, way, at, leap = np.zeros(3, np.int64), np.zeros(3), np.zeros(3, np.int64), np.zeros(3)
+        low, high = 0.0, 1.0
+        for k in range(3):
+            d = (pose[k, 0] * rays[p, 0] + pose[k, 1] * rays[p, 1] + pose[k, 2]) * z / side
+            d = d if abs(d) > 1e-9 else 1e-9
+            a, b = -start[k] / d, (evidence.shape[k] - 1e-6 - start[k]) / d
+            low, high = max(low, min(a, b)), min(high, max(a, b))
+            leap[k], step[k] = 1.0 / abs(d), 1 if d > 0 else -1
+            way[k] = d
+        if low >= high:
+            continue
+        for k in range(3):
+            place = start[k] + (low + 1e-9) * way[k]
+            at[k] = min(max(int(np.floor(place)), 0), evidence.shape[k] - 1)
+            way[k] = low + ((at[k] + (step[k] > 0)) - place) / way[k]
+        last = high - leap.min() if high == 1.0 else high
+        while 0 <= at[0] < nx and 0 <= at[1] < ny and 0 <= at[2] < nz:
+            k = 0 if way[0] <= way[1] and way[0] <= way[2] else (1 if way[1] <= way[2] else 2)
+            if way[k] > last:
+                break
+            i, j, m = at[0], at[1], at[2]
+            if not passed[i, j, m] and hits[i, j, m] == 0:
+                passed[i, j, m] = True
+                if evidence[i, j, m] > -1:
+                    evidence[i, j, m] -= 1
+            at[k] += step[k]
+            way[k] += leap[k]
+
+
+def by_rays(made: OccupancyMap, camera: Camera, look: Look, q: np.ndarray, held: tuple[AttachedObject, ...]) -> None:
+    """Change a map as rays do: hits as the map has them, the way to them by :func:`follow`."""
+    settings, (_, samples) = made.settings, made._blocks_of(camera)
+    stride = settings.stride
+    points = SeenPoints.of(
+        samples, look.depth[::stride, ::stride], made._own_spheres(q, held, look.assumed, camera.depth.noise)
+    )
+    hits = np.zeros_like(made.evidence)
+    z = points.depths.astype(float)
+    good = (z >= camera.depth.nearest) & (z <= camera.depth.farthest) & (points.left_out == 0)
+    local = np.concatenate([points.rays, np.ones((len(z), 1))], axis=1)[good] * z[good, None]
+    world = local @ look.assumed[:3, :3].T + look.assumed[:3, 3]
+    cells = np.floor((world - made.origin) / made.resolution).astype(int)
+    cells = cells[((cells >= 0) & (cells < made.evidence.shape)).all(axis=1)]
+    chosen, counts = np.unique(np.ravel_multi_index(tuple(cells.T), made.evidence.shape), return_counts=True)
+    chosen = chosen[counts >= settings.least]
+    flat = made.evidence.reshape(-1)
+    flat[chosen] = np.minimum(np.maximum(flat[chosen], 0) + settings.persistence, settings.longest)
+    hits.reshape(-1)[chosen] = 1
+    follow(
+        made.evidence, hits, z, points.left_out, points.rays, look.assumed, made.origin, made.resolution
+    )  # fmt: skip
+
+
+def distances(points: np.ndarray, solids: list[Solid], limit: float) -> np.ndarray:
+    """Return the signed distances of points from solids, at most ``limit``, shape (N,) [m]."""
+    found = np.full(len(points), limit)
+    for shape, pose in solids:
+        shape.computeLocalAABB()
+        box, local = shape.aabb_local, (points - pose[:3, 3]) @ pose[:3, :3]
+        near = ((local > box.min_ - limit) & (local < box.max_ + limit)).all(axis=1)
+        found[near] = np.minimum(found[near], signed_distances(shape, np.ascontiguousarray(local[near]), limit))
+    return found
+
+
+def errors(made: OccupancyMap, truth: Truth) -> dict[str, float]:
+    """Return shares of a map."""
+    steps = np.stack(np.meshgrid(*[(-1, 0, 1)] * 3), axis=-1).reshape(-1, 3) * made.resolution
+    covered = np.any([made.look_up(truth.surface + step) > 0 for step in steps], axis=0)
+    gap = distances(made.points(), truth.solids, made.ball_radius + 2.0 * OFF) - made.ball_radius
+    return {
+        "covered": float(covered.mean()), "free": float(made.free.mean()),
+        "off": float((gap > 0.0).mean()), "far off": float((gap > OFF).mean()),
+        "freed": float((made.look_up(truth.inside) < 0).mean()), "sure": float(made.free[truth.free].mean()),
+    }  # fmt: skip
+
+
+def truth_of(made: Robot, problem: Problem, q: np.ndarray, seen: list[Look], exact: OccupancyMap) -> Truth:
+    """Return the truth about a scene; ``exact`` is an empty map."""
+    data = made.model.createData()
+    pin.forwardKinematics(made.model, data, made.to_pinocchio(q))
+    links = [
+        (item.geometry, (data.oMi[item.parentJoint] * item.placement).homogeneous)
+        for item in made.geometry.geometryObjects
+    ]
+    links += [(coal_geometry(one), made.link_pose(q, one.link) @ one.pose) for one in problem.attached]
+    solids = [world_geometry(one) for one in (*problem.scene, *ROOM, *made.fixtures)]
+    cells = np.random.default_rng(1).integers(0, exact.evidence.shape, (100_000, 3))
+    centers = (cells + 0.5) * exact.resolution + exact.origin
+    inside = centers[np.minimum(distances(centers, solids, 0.01), distances(centers, links, 0.01)) < 0.0]
+    surface = []
+    for look in seen:
+        rays = np.concatenate([CAMERA.grid, np.ones((*CAMERA.grid.shape[:2], 1))], axis=2) * look.true[..., None]
+        rays = rays[(look.true > 0.0) & (np.abs(look.true - look.without_robot) < 1e-6)][::5]
+        points = rays @ look.pose[:3, :3].T + look.pose[:3, 3]
+        surface.append(points[((points > BOX[0]) & (points < BOX[1])).all(axis=1)])
+    for look in seen:
+        by_rays(exact, CAMERA, look._replace(depth=look.true, assumed=look.pose), q, tuple(problem.attached))
+    return Truth(solids, inside, np.concatenate(surface), exact.free)
+
+
+def tested(made: Robot, problem: Problem, q: np.ndarray, seen: list[Look], side: float) -> dict[str, dict[str, Any]]:
+    """Return times and shares of both ways."""
+    held = tuple(problem.attached)
+    truth = truth_of(made, problem, q, seen, OccupancyMap(BOX, side, made))
+    found: dict[str, dict[str, Any]] = {}
+    for name in ("look-up", "rays"):
+        one = OccupancyMap(BOX, side, made)
+        times = []
+        for look in seen:
+            started = time.process_time()
+            if name == "rays":
+                by_rays(one, CAMERA, look, q, held)
+            else:
+                one.integrate(look.depth, CAMERA, look.assumed, q, held)
+            times.append(1e3 * (time.process_time() - started))
+        found[name] = {"ms": times[1:], **errors(one, truth)}
+    return found
+
+
+def planned(made: Robot, problem: Problem, seen: OccupancyMap, q: np.ndarray, unknown: Any) -> dict[str, Any]:
+    """Return how a plan in a map went."""
+    world = seen.world(unknown, q, held=problem.attached, margin=MARGIN)
+    fields = {"scene": world, "allowed": ()}
+    started = time.process_time()
+    result = plan(problem.model_copy(update=fields), timeout=20.0, seed=0)
+    spent = time.process_time() - started
+    if not result or result.path is None:
+        return {"solved": False, "reason": result.reason, "status": str(result.status), "cpu_s": spent}
+    truth = CollisionChecker(made, problem.scene, problem.attached, problem.allowed, proofs=False)
+    return {"solved": True, "free": bool(truth.are_free(result.path.sample(0.02)).all()), "cpu_s": spent}
+
+
+def main() -> None:
+    """Measure, and write the results."""
+    parser = record.parser(__doc__ or "")
+    parser.add_argument("-n", type=int, default=8, help="problems (default: %(default)s)")
+    parser.add_argument("--plans", type=int, default=8, help="problems of them that are planned (default: %(default)s)")
+    given, made, rng = parser.parse_args(), robot(), np.random.default_rng(0)
+    names = [problems.frozen_names(suite, "easy")[k] for k in range(given.n) for suite in SUITES][: given.n]
+    found: dict[tuple[str, float], list[dict[str, Any]]] = {}
+    plans: dict[str, list[dict[str, Any]]] = {"free": [], "blocked": []}
+    for count, name in enumerate(tqdm(names)):
+        problem = problems.load(name)
+        q = np.array([problem.start[joint] for joint in made.joint_names])
+        seen = looks(made, problem, q, rng, FRONT)
+        for side in SIDES:
+            for way, row in tested(made, problem, q, seen, side).items():
+                found.setdefault((way, side), []).append(row)
+        if count < given.plans:
+            kept = OccupancyMap(BOX, PLANNED, made)
+            for look in looks(made, problem, q, rng, AROUND):
+                kept.integrate(look.depth, CAMERA, look.assumed, q, problem.attached)
+            for unknown, rows in plans.items():
+                rows.append({"problem": name, **planned(made, problem, kept, q, unknown)})
+    lines = [tables(found), "", plan_table(plans)]
+    rows = [{"way": way, "side": side, "problems": some} for (way, side), some in found.items()]
+    record.write("perception_voxels", {"rows": rows, "plans": plans}, "\n".join(lines), n=given.n, plans=given.plans)
+
+
+def tables(found: dict[tuple[str, float], list[dict[str, Any]]]) -> str:
+    """Return the table of times and shares, means over problems."""
+    kinds = ("covered", "off", "far off", "free", "sure", "freed")
+    head = ["voxels", "mm", "ms p50", "ms worst", *[f"{kind} %" for kind in kinds]]
+    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
+    for (way, side), some in sorted(found.items(), key=lambda item: (item[0][1], item[0][0])):
+        times = np.concatenate([one["ms"] for one in some])
+        shares = [f"{100.0 * np.mean([one[kind] for one in some]):.2f}" for kind in kinds]
+        lines.append(record.row([way, f"{1e3 * side:g}", f"{np.median(times):.1f}", f"{times.max():.1f}", *shares]))
+    return "\n".join(lines)
+
+
+def plan_table(plans: dict[str, list[dict[str, Any]]]) -> str:
+    """Return the table of plans."""
+    head = ["unknown space", "N", "solved", "free in the true scene", "CPU s p50"]
+    lines = [record.row(head), record.row(["---", *["---:"] * 4])]
+    for unknown, some in plans.items():
+        solved = [one for one in some if one["solved"]]
+        spent = f"{np.median([one['cpu_s'] for one in some]):.1f}" if some else ""
+        lines.append(record.row([unknown, len(some), len(solved), sum(one["free"] for one in solved), spent]))
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    run_script(main)
