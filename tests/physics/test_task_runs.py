@@ -159,6 +159,11 @@ def test_runners_refuse_bad_input(error: type[ApexError], match: str, given: dic
         TaskRunner(cached_problem("stack_boxes"), **given)
 
 
+def test_obstacles_stand_still() -> None:
+    with pytest.raises(ParameterError, match="stand still"):
+        TaskRunner(cached_problem("vertical/moving-large-0.1/900001"))
+
+
 def test_seeds_are_not_negative() -> None:
     with pytest.raises(ParameterError, match="seed"):
         TaskRunner(cached_problem("reach_past_post")).run(-1)
@@ -175,7 +180,7 @@ def test_seeds_are_not_negative() -> None:
         (["stack_boxes", "--driver", "mujoco", "--seed", "-1"], "seed"),
         (["stack_boxes", "--driver", "mujoco", "--timeout", "nan"], "timeout"),
         (["stackboxes", "--driver", "mujoco"], "stackboxes"),
-        (["vertical/moving-large-0.1/900001", "--driver", "mujoco"], "stand still"),
+        (["vertical/moving-large-0.1/900001", "--driver", "mujoco", "--film", "f.mp4"], "stand still"),
     ],
 )
 def test_the_command_refuses_bad_input(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
