@@ -241,7 +241,6 @@ def test_a_robot_at_rest_is_left_alone() -> None:
      ({"sensor": 5}, "sensor: expected a Sensor, or an object with read"),
      ({"sensor": Camera(), "settings": LoopSettings(error=0.01)}, "settings: expected both, .* 'no fastest"),
      ({"tolerance": -1.0}, "tolerance"), ({"driver": "kinematic", "tolerance": float("nan")}, "tolerance")],
-    ids=str,
 )  # fmt: skip
 def test_what_is_asked_for_wrongly_is_named(given: dict[str, Any], words: str) -> None:
     world = environment_of(problems.load(PROBLEM))
