@@ -111,9 +111,10 @@ from test_ros2 import motion_from
 robot = load_robot("dual_panda_softhand")
 joints = {joints!r}
 driver = Ros2Driver(robot, joints, renamed={{name: {prefix!r} + name for name in robot.joint_names}}, started=60.0)
-motion = motion_from(robot, robot.home, 0.4)
+motion = motion_from(robot, robot.home, 0.4).slower(3.0)
 driver.send(motion, driver.time + 0.1)
-time.sleep(0.1 + 0.5 * motion.duration)
+while np.abs(driver.state().positions - robot.home).max() < 0.1:
+    time.sleep(0.005)
 os.kill(os.getpid(), 9)
 """
 
@@ -125,8 +126,8 @@ def test_a_client_that_is_killed_leaves_the_robot_at_rest(robot: Robot, stand_in
     )  # fmt: skip
     killed = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert killed.returncode == -signal.SIGKILL
-    time.sleep(1.0)
-    motion = motion_from(robot, robot.home, 0.4)
+    motion = motion_from(robot, robot.home, 0.4).slower(3.0)
+    time.sleep(motion.duration + 0.5)
     times, states = stand_ins.followed()
     late = times > times.max() - 3 * 10**8
     assert late.sum() > 5
