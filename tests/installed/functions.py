@@ -297,6 +297,9 @@ def _use_run() -> None:
         loop.abort("enough")
         assert loop.step(0.01) is not None and loop.outcome is not None and loop.reason == "enough"
         assert loop.events[-1].time <= 0.03
+    with apex_ompl.Loop(problem, settings=settings) as loop:
+        loop.end("at once")
+        assert loop.outcome is not None and loop.reason == "at once"
 
     class Camera:
         def read(self, now: float) -> Observation:
