@@ -123,6 +123,10 @@ class DrivenRun:
                     self.loop.end("the clock of the driver stands still")
         record, end = self.loop.record, self.loop.record.trajectory.duration
         self._wait(end)
+        patience = time.monotonic() + self.cycle.context.settings.silence
+        while not self.simulated and self.times and self.times[-1] < end and time.monotonic() < patience:
+            time.sleep(POLL)  # states arrive later than they were measured
+            self._measured(self.driver.time - self.zero)
         self.cycle.advance(max(end, self._last), self.positions[-1] if self.positions else None)
         return replace(record, measured={**record.measured, **self._figures(record.trajectory)})
 
