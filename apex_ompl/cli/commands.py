@@ -14,8 +14,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from apex_ompl import __version__
-from apex_ompl.cli.options import import_extra, name_value_pairs
+from apex_ompl.cli.options import name_value_pairs
 from apex_ompl.errors import ParameterError
+from apex_ompl.util.extras import import_extra
 
 
 def bench(parsed: argparse.Namespace) -> int:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib import import_module
-from types import ModuleType
 
-from apex_ompl.errors import MissingFileError, ParameterError
+from apex_ompl.errors import ParameterError
 
 LIMITS = ("velocity", "acceleration", "jerk")
 """Limits with the options ``--NAME-scale`` and ``--max-NAME``."""
@@ -40,21 +38,3 @@ def numbers_by_name(option: str, pairs: Sequence[str]) -> dict[str, float]:
         except ValueError as error:
             raise ParameterError(option, f"{name}={value}", "NAME=NUMBER") from error
     return found
-
-
-def import_extra(module: str, purpose: str, extra: str) -> ModuleType:
-    """Return a module that needs an optional extra of the package.
-
-    Args:
-        module: Its name.
-        purpose: What it is for, for the message.
-        extra: Name of the extra.
-
-    Raises:
-        MissingFileError: A package is not installed.
-    """
-    try:
-        return import_module(module)
-    except ImportError as error:
-        name = error.name or "a package"
-        raise MissingFileError(name, f"package for {purpose}", f"install the extra: apex-ompl[{extra}]") from error

@@ -6,11 +6,11 @@ import argparse
 from pathlib import Path
 
 from apex_ompl.api import load_problem
-from apex_ompl.cli.options import import_extra
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import RunResult
 from apex_ompl.result import PlanResult
 from apex_ompl.scene.problem import Problem
+from apex_ompl.util.extras import import_extra
 from apex_ompl.util.files import check_writable
 from apex_ompl.viz.render import render as draw
 from apex_ompl.viz.sources import is_saved, load_saved

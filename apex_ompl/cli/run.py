@@ -11,8 +11,12 @@ from apex_ompl.loop.result import INTERRUPTED, SUFFIXES, Outcome
 from apex_ompl.loop.run import DRIVERS
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.problems.worlds import ScriptedEnvironment
-from apex_ompl.util.files import check_writable, suffix_of
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.extras import import_extra
+from apex_ompl.util.files import check_writable, suffix_of, write_atomically
 from apex_ompl.util.validation import check_name
+
+FILMS, FILM_SIZE = (".mp4",), (640, 480)  # of tasks in physics [pixels]
 
 
 def run(parsed: argparse.Namespace) -> int:
@@ -21,9 +25,7 @@ def run(parsed: argparse.Namespace) -> int:
         check_name(parsed.driver, "driver", DRIVERS)
     environment = api.load_environment(parsed.world)
     if parsed.driver == "mujoco" and isinstance(environment, ScriptedEnvironment) and environment.still:
-        from apex_ompl.cli.physics import execute
-
-        return execute(environment.problem, parsed)
+        return _execute(environment.problem, parsed)
     if parsed.film is not None:
         expected = "a problem whose obstacles stand still, with --driver mujoco; films of runs: apex-ompl render"
         raise ParameterError("--film", str(parsed.film), expected)
@@ -44,4 +46,37 @@ def run(parsed: argparse.Namespace) -> int:
         return 3
     if result.outcome is Outcome.ABORTED and result.reason.endswith(INTERRUPTED):
         return 130
+    return 0 if result else 1
+
+
+def _execute(problem: Problem, parsed: argparse.Namespace) -> int:
+    """Execute a task in physics, write its log and film, print the outcome, and return the exit code."""
+    from apex_ompl.physics.execution import FILM_RATE
+    from apex_ompl.physics.result import SUFFIXES, UNPLANNED
+    from apex_ompl.physics.runner import TaskRunner
+
+    for file, known in ((parsed.out, SUFFIXES), (parsed.film, FILMS)):
+        if file is not None:
+            suffix_of(file, known)
+            check_writable(file)
+    if parsed.film is not None:
+        import_extra("imageio.v3", "films", "viz")  # which is missed now, not after the run
+    runner = TaskRunner(problem, timeout=parsed.timeout)
+    result, frames = runner.run(parsed.seed, FILM_SIZE if parsed.film is not None else None)
+    if parsed.out is not None:
+        result.save(parsed.out)
+    if parsed.film is not None:
+        from apex_ompl.viz.render import encode
+
+        if not frames:
+            raise ParameterError("--film", str(parsed.film), f"a task that was planned; {result.reason}")
+        write_atomically(parsed.film, encode(frames, parsed.film.suffix, FILM_RATE))
+    if parsed.json:
+        print(json.dumps(result.as_dict()))
+    else:
+        print(result)
+        for check in result.checks:
+            print(f"  {'yes' if check.passed else 'NO '}  {check.name}: {check.found}")
+    if result.outcome == UNPLANNED:
+        return 3
     return 0 if result else 1

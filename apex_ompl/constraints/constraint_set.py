@@ -407,11 +407,13 @@ class _Tables:
         frame, turn, parts = self._frame(c.frame), _rotation(c.orientation), list[Part]()
         own, origin = frame.turned(np.eye(3)), np.array(c.position)
         for k in range(3):
-            lower, upper = c.lower[k], c.upper[k]
-            if lower is None and upper is None:
-                continue
-            low = lower if lower is not None else upper - 2.0 * HALF_SPACE  # type: ignore[operator]
-            high = upper if upper is not None else low + 2.0 * HALF_SPACE
+            low, high = c.lower[k], c.upper[k]
+            if low is None:
+                if high is None:
+                    continue
+                low = high - 2.0 * HALF_SPACE
+            if high is None:
+                high = low + 2.0 * HALF_SPACE
             half = (high - low) / 2.0
             along = np.roll(turn, -k, axis=1)  # axis k first
             group = ConstraintGroup(

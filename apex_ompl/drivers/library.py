@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from ctypes.util import find_library
-from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
-from apex_ompl.errors import MissingFileError
-from apex_ompl.util.forking import unforked
+from apex_ompl.util.extras import import_extra, names_of
 
 
 def mujoco() -> Any:
@@ -21,11 +18,7 @@ def mujoco() -> Any:
     """
     if not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl" if find_library("EGL") else "osmesa")  # which is read at the import
-    try:
-        with unforked():
-            return import_module("mujoco")
-    except ImportError as error:
-        raise MissingFileError("mujoco", "package for physics", "install the extra: apex-ompl[twin]") from error
+    return import_extra("mujoco", "physics", "twin")
 
 
 def rclpy() -> Any:
@@ -48,11 +41,7 @@ def rosbags() -> Any:
     Raises:
         MissingFileError: The extra ``bags`` is not installed.
     """
-    try:
-        with unforked():
-            bags, types = import_module("rosbags.rosbag2"), import_module("rosbags.typesys")
-    except ImportError as error:
-        raise MissingFileError("rosbags", "package for bags of ROS 2", "install the extra: apex-ompl[bags]") from error
+    bags, types = (import_extra(f"rosbags.{one}", "bags of ROS 2", "bags") for one in ("rosbag2", "typesys"))
     return SimpleNamespace(
         Writer=bags.Writer, plugin=bags.StoragePlugin, types=types.get_typestore(types.Stores.ROS2_JAZZY)
     )
@@ -78,23 +67,3 @@ def franky() -> Any:
     """
     places = {"franky": ("JointImpedanceTracker", "RealtimeConfig", "Robot")}
     return names_of(places, "franky", "Franka's arms", "fr3")
-
-
-def names_of(places: Mapping[str, tuple[str, ...]], package: str, purpose: str, extra: str) -> Any:
-    """Return names of an optional package as one namespace.
-
-    Args:
-        places: The names by the modules that have them.
-        package: Name of the package.
-        purpose: What it is for.
-        extra: The extra that installs it.
-
-    Raises:
-        MissingFileError: It is not installed.
-    """
-    try:
-        with unforked():
-            found = {name: getattr(import_module(module), name) for module, names in places.items() for name in names}
-    except ImportError as error:
-        raise MissingFileError(package, f"package for {purpose}", f"install the extra: apex-ompl[{extra}]") from error
-    return SimpleNamespace(**found)

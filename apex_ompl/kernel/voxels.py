@@ -14,6 +14,7 @@ from apex_ompl.util.arrays import compact
 SPREAD = 2.507  # extent of a normal distribution whose density is that of its middle [standard deviations]
 LEAST_NOISE = 1e-9
 FREE, UNKNOWN = voxels.FREE, voxels.UNKNOWN  # evidence of voxels; larger numbers are those of occupied ones
+ENOUGH = voxels.ENOUGH
 
 
 class ImageBlocks(NamedTuple):
@@ -160,15 +161,27 @@ class VoxelUpdate(NamedTuple):
     angle: float
     shift: float
 
-    def apply(self, evidence: Bytes, windows: DepthWindows, points: SeenPoints) -> None:
-        """Change the evidence of voxels, shape (nx, ny, nz)."""
-        blocks, pose, hits = windows.blocks, compact(self.pose), np.zeros_like(evidence)
+    def fill(self, evidence: Bytes, points: SeenPoints, span: tuple[float, float]) -> Bytes:
+        """Raise the evidence of voxels that hold enough points, and return how many each holds, ENOUGH where they are.
+
+        Args:
+            evidence: The evidence, shape (nx, ny, nz).
+            points: The points.
+            span: Smallest and largest depth that count [m].
+        """
+        hits = np.zeros_like(evidence)
         sharp = self.side / (SPREAD * max(self.noise, LEAST_NOISE))
         voxels.fill_voxels(
-            evidence, hits, points.depths, points.rays, points.left_out, windows.nearest, windows.farthest, pose,
-            self.origin, self.side, points.density * self.side * self.side, sharp, self.share, float(self.least),
-            self.gain, self.most,
+            evidence, hits, points.depths, points.rays, points.left_out, *span, compact(self.pose), self.origin,
+            self.side, points.density * self.side * self.side, sharp, self.share, float(self.least), self.gain,
+            self.most,
         )  # fmt: skip
+        return hits
+
+    def apply(self, evidence: Bytes, windows: DepthWindows, points: SeenPoints) -> None:
+        """Change the evidence of voxels, shape (nx, ny, nz)."""
+        blocks, pose = windows.blocks, compact(self.pose)
+        hits = self.fill(evidence, points, (windows.nearest, windows.farthest))
         halves = 0.5 * self.side * np.abs(pose[:3, :3]).sum(axis=0)  # along the axes of the camera
         corner, side = blocks.plane
         widest = np.abs(np.stack([corner, corner + side * blocks.shape[::-1]])).max(axis=0)

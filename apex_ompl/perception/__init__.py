@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from apex_ompl.perception.depth_scale import measured_depths as measured_depths
     from apex_ompl.perception.frames import Frame as Frame
     from apex_ompl.perception.frames import load_frames as load_frames
+    from apex_ompl.perception.frames import mean_frame as mean_frame
     from apex_ompl.perception.frames import save_sequence as save_sequence
     from apex_ompl.perception.hand_eye import Calibration as Calibration
     from apex_ompl.perception.hand_eye import View as View
@@ -42,7 +43,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "boards": "Board",
         "camera": "Camera DepthErrors look_at",
         "depth_scale": "measured_depths",
-        "frames": "Frame load_frames save_sequence",
+        "frames": "Frame load_frames mean_frame save_sequence",
         "hand_eye": "Calibration View calibrate",
         "held": "HeldObject HeldObjectFinder HeldSettings",
         "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",

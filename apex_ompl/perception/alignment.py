@@ -13,8 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.perception.averaging import mean_frame
-from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.frames import Frame, mean_frame
 from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
 from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle
 from apex_ompl.perception.registration import CorrectedFrame, corrected
@@ -71,7 +70,7 @@ class SeenTask:
         alignment: The alignment, of the objects of ``attached``.
         attached: The held objects as they were seen.
         vectors: Contact faces of both objects as vectors in the world; empty without a task.
-        obstacles: Obstacles, larger by the margin.
+        obstacles: Obstacles, larger by the margin; of boxes seen from one side it may be too small.
         held: All held objects with their covariances.
         seen: All obstacles with their covariances.
         camera: Corrected pose of the optical frame in the world, shape (4, 4) [m].
@@ -153,7 +152,11 @@ def _wanted(alignment: Alignment, names: Sequence[str], robot: Robot) -> set[str
         if named in names:
             wanted.add(named)
         elif named not in robot.hands:
-            raise ParameterError(f"alignment.{side}", named, f"one of {', '.join([*names, *robot.hands])}")
+            raise ParameterError(
+                f"alignment.{side}",
+                named,
+                f"one of {', '.join([*names, *robot.hands]) or 'the held objects and hands, of which there is none'}",
+            )
     return wanted
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,8 @@ from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, Param
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.synchronizer import TOLERANCE, Synchronizer
+from apex_ompl.util.extras import import_extra
 from apex_ompl.util.files import path_text
-from apex_ompl.util.forking import unforked
 
 ROLE = "bag of ROS 2"
 COLOR, ALIGNED = "/camera/camera/color/image_raw", "/camera/camera/aligned_depth_to_color/image_raw"
@@ -90,11 +89,7 @@ def _reader() -> Callable[[Path], Any]:
     Raises:
         MissingFileError: The extra ``bags`` is not installed.
     """
-    try:
-        with unforked():
-            reading, types = import_module("rosbags.highlevel"), import_module("rosbags.typesys")
-    except ImportError as error:
-        raise MissingFileError("rosbags", "package for bags of ROS 2", "install the extra: apex-ompl[bags]") from error
+    reading, types = (import_extra(f"rosbags.{one}", "bags of ROS 2", "bags") for one in ("highlevel", "typesys"))
     store = types.get_typestore(types.Stores.ROS2_JAZZY)  # for bags without definitions
     return lambda path: reading.AnyReader([path], default_typestore=store)
 

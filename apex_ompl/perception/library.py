@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
-from apex_ompl.errors import MissingFileError
-from apex_ompl.util.forking import unforked
-
-HINT = "install the extra: apex-ompl[perception]"
+from apex_ompl.util.extras import import_extra
 
 
 def opencv() -> Any:
@@ -18,11 +14,7 @@ def opencv() -> Any:
     Raises:
         MissingFileError: The extra ``perception`` is not installed.
     """
-    try:
-        with unforked():
-            return import_module("cv2")
-    except ImportError as error:
-        raise MissingFileError("cv2", "package for images", HINT) from error
+    return import_extra("cv2", "images", "perception")
 
 
 def least_squares() -> Callable[..., Any]:
@@ -31,9 +23,5 @@ def least_squares() -> Callable[..., Any]:
     Raises:
         MissingFileError: The extra ``perception`` is not installed.
     """
-    try:
-        with unforked():
-            found: Callable[..., Any] = import_module("scipy.optimize").least_squares
-            return found
-    except ImportError as error:
-        raise MissingFileError("scipy", "package for least squares", HINT) from error
+    found: Callable[..., Any] = import_extra("scipy.optimize", "least squares", "perception").least_squares
+    return found

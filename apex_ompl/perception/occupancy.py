@@ -221,16 +221,21 @@ class OccupancyMap:
     def _update(self, frame: Frame, pose: Array, spheres: Array) -> None:
         """Change the map by a frame of a camera at a pose, without what is in spheres of the optical frame."""
         camera, settings = frame.camera, self.settings
-        depth, stride, spreads = camera.depth, settings.stride, settings.spreads
+        depth, stride = camera.depth, settings.stride
         blocks, samples = self._blocks_of(camera)
         image = frame.depth * depth.scale
         windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing, LEVELS)
         points = SeenPoints.of(samples, image[::stride, ::stride], spheres)
-        VoxelUpdate(
+        self._change(camera, pose).apply(self.evidence, windows, points)
+
+    def _change(self, camera: Camera, pose: Array) -> VoxelUpdate:
+        """Return how images of a camera at a pose change the evidence."""
+        settings, depth, spreads = self.settings, camera.depth, self.settings.spreads
+        return VoxelUpdate(
             self.origin, self.resolution, pose, settings.share, settings.least, settings.persistence,
             settings.longest, depth.noise, spreads * depth.scale_spread, spreads * camera.angle_spread,
             spreads * camera.position_spread,
-        ).apply(self.evidence, windows, points)  # fmt: skip
+        )  # fmt: skip
 
     @cached_property
     def _checker(self) -> CollisionChecker:

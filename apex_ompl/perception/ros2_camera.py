@@ -8,13 +8,13 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from apex_ompl.drivers.library import names_of
 from apex_ompl.errors import ApexError, DriverError, ParameterError
 from apex_ompl.perception.bags import ALIGNED, COLOR, INFO, STATES
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.synchronizer import TOLERANCE, Synchronizer
 from apex_ompl.util.display import one_line
+from apex_ompl.util.extras import names_of
 from apex_ompl.util.validation import check_integer, check_positive
 
 NEEDED = {

@@ -9,7 +9,8 @@ The checks are derived from the problem and from where its plan has the objects 
 - what stands on a tray stands on it,
 - a liquid is in the vessels that were to stay upright, or for the most part in the one that it was poured into,
 - no object is on the floor, liquids apart,
-- hands are where the plan ends, and where none holds an object, no link touched an obstacle or a fixture.
+- hands, or without hands the joints, are where the plan ends, and where none holds an object, no link touched an
+  obstacle or a fixture.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ FALLEN = 0.15  # level distance between where an object was released and where i
 ALIGNED, ALIGNED_ANGLE = 0.015, 0.2  # of faces beyond the tolerance of the alignment
 SPEED = 0.02  # of objects at rest [m/s]
 EXACT = Tolerance(lateral=1e-3, axial=1e-3, angle=1e-3)  # of faces that a line brings together
-REACHED = 0.01  # of palms from where the plan ends [m]
+REACHED, REACHED_ANGLE = 0.01, 0.01  # of palms from where the plan ends, without hands of joints [m, rad]
 STAYED, POURED = 1.0, 0.75  # least shares of a liquid
 
 
@@ -120,6 +121,9 @@ class Judge:
             off = driver.pose(hand.palm)[:3, 3] - robot.link_pose(self.end, hand.palm)[:3, 3]
             away = float(np.linalg.norm(off))
             yield Check(f"{name} is where the plan ends", away <= REACHED, f"{1e3 * away:.1f} mm off")
+        if not robot.hands:
+            most = float(np.abs(driver.state().positions - self.end).max())
+            yield Check("the robot is where the plan ends", most <= REACHED_ANGLE, f"a joint is {most:.4f} rad off")
 
     def _held(self, one: Intended) -> Check:
         pose = np.linalg.inv(self.driver.pose(one.link)) @ self.driver.pose(one.name)

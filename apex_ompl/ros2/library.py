@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from apex_ompl.drivers.library import names_of
+from apex_ompl.util.extras import names_of
 
 NEEDED = {
     "rclpy": ("Context", "Parameter", "create_node", "init"), "rclpy.executors": ("SingleThreadedExecutor",),

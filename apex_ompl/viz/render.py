@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.errors import MissingFileError, ParameterError
+from apex_ompl.errors import ParameterError
 from apex_ompl.loop.result import RunResult
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.path import resample
@@ -23,6 +23,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
+from apex_ompl.util.extras import import_extra
 from apex_ompl.util.files import check_writable, write_atomically
 from apex_ompl.viz.appearance import (
     BACKGROUND,
@@ -151,11 +152,7 @@ def _pyvista() -> Any:
     """Return the module ``pyvista``, set up for a machine without a display."""
     window = "vtkEGLRenderWindow" if find_library("EGL") else "vtkOSOpenGLRenderWindow"
     os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", window)
-    try:
-        import pyvista
-    except ImportError as error:
-        raise MissingFileError("pyvista", "package for pictures", "install the extra: apex-ompl[viz]") from error
-    return pyvista
+    return import_extra("pyvista", "pictures", "viz")
 
 
 def render(
@@ -204,7 +201,7 @@ def _problem_picture(problem: Problem, out: Path, size: tuple[int, int], azimuth
     renderer = SceneRenderer(setup, size, azimuth)
     if len(setup.goals):
         renderer.add_ghost(setup.goals[0])
-    return _encode([renderer.screenshot(setup.start)], ".png")
+    return encode([renderer.screenshot(setup.start)], ".png")
 
 
 def _film(source: PlanResult | RunResult, suffix: str, size: tuple[int, int], azimuth: float) -> bytes:
@@ -215,7 +212,7 @@ def _film(source: PlanResult | RunResult, suffix: str, size: tuple[int, int], az
     else:
         sample = motion.sample(max(1.0 / FRAME_RATE, motion.duration / MAX_FRAMES))
         frames = [_moment(renderer, source, motion, float(t)) for t in np.atleast_1d(sample.time)]
-    return _encode([*frames, *[frames[-1]] * (FRAME_RATE // 2)], suffix)
+    return encode([*frames, *[frames[-1]] * (FRAME_RATE // 2)], suffix)
 
 
 def _strip(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float) -> bytes:
@@ -228,7 +225,7 @@ def _strip(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float
     else:
         frames = [renderer.screenshot(q) for q in resample(_path(source), columns * rows)]
     grid = [np.concatenate(frames[k * columns : (k + 1) * columns], axis=1) for k in range(rows)]
-    return _encode([np.concatenate(grid, axis=0)], ".png")
+    return encode([np.concatenate(grid, axis=0)], ".png")
 
 
 def _renderer(source: PlanResult | RunResult, size: tuple[int, int], azimuth: float) -> SceneRenderer:
@@ -266,16 +263,24 @@ def caption(run: RunResult, time: float) -> str:
     return f"{time:.2f} s" + (f"   {last[-1].kind} at {last[-1].time:.2f} s" if last else "")
 
 
-def _encode(frames: Sequence[NDArray[np.uint8]], suffix: str) -> bytes:
-    """Return frames as a file; a .gif has half the size."""
-    import imageio.v3 as iio
+def encode(frames: Sequence[NDArray[np.uint8]], suffix: str, rate: float = FRAME_RATE) -> bytes:
+    """Return frames, each of shape (height, width, 3), as the content of a file; a .gif has half the size.
 
+    Args:
+        frames: The frames; of a .png the first one counts.
+        suffix: .png, .gif or .mp4.
+        rate: Frames in a second.
+
+    Raises:
+        MissingFileError: The extra ``viz`` is not installed.
+    """
+    iio = import_extra("imageio.v3", "pictures and films", "viz")
     buffer = io.BytesIO()
     if suffix == ".png":
         iio.imwrite(buffer, frames[0], extension=".png")
     elif suffix == ".gif":
         small = [frame[::2, ::2] for frame in frames]
-        iio.imwrite(buffer, small, extension=".gif", duration=1000 / FRAME_RATE, loop=0)
+        iio.imwrite(buffer, small, extension=".gif", duration=1000 / rate, loop=0)
     else:
-        return bytes(iio.imwrite("<bytes>", np.stack(frames), extension=".mp4", fps=FRAME_RATE, codec="libx264"))
+        return bytes(iio.imwrite("<bytes>", np.stack(frames), extension=".mp4", fps=rate, codec="libx264"))
     return buffer.getvalue()

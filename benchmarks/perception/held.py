@@ -25,7 +25,7 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from apex_ompl.perception.averaging import mean_frame
+from apex_ompl.perception.frames import mean_frame
 from apex_ompl.perception.held import HeldObjectFinder
 from apex_ompl.perception.rendering import Mujoco, Renderer, ZBuffer
 from apex_ompl.perception.synthetic import SceneGenerator, SyntheticSettings, TrueObject
@@ -37,7 +37,7 @@ from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
 
 DEPENDS = (
-    "apex_ompl/perception/held.py", "apex_ompl/perception/registration.py", "apex_ompl/perception/averaging.py",
+    "apex_ompl/perception/held.py", "apex_ompl/perception/registration.py", "apex_ompl/perception/frames.py",
     "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py", "apex_ompl/perception/synthetic.py",
     "apex_ompl/perception/camera.py", "apex_ompl/kernel/compiled/perception", "apex_ompl/kernel/perception.py",
 )  # fmt: skip

@@ -31,7 +31,7 @@ from apex_ompl import plan, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.kernel.voxels import SeenPoints
+from apex_ompl.kernel.voxels import ENOUGH, SeenPoints
 from apex_ompl.perception import Camera, OccupancyMap, look_at
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
@@ -151,23 +151,13 @@ def follow(evidence, hits, depth, left_out, rays, pose, origin, side):  # type: 
 
 def by_rays(made: OccupancyMap, camera: Camera, look: Look, q: np.ndarray, held: tuple[AttachedObject, ...]) -> None:
     """Change a map as rays do: hits as the map has them, the way to them by :func:`follow`."""
-    settings, (_, samples) = made.settings, made._blocks_of(camera)
-    stride = settings.stride
+    stride, (_, samples) = made.settings.stride, made._blocks_of(camera)
     points = SeenPoints.of(
         samples, look.depth[::stride, ::stride], made._own_spheres(q, held, look.assumed, camera.depth.noise)
     )
-    hits = np.zeros_like(made.evidence)
+    span = camera.depth.nearest, camera.depth.farthest
+    hits = (made._change(camera, look.assumed).fill(made.evidence, points, span) == ENOUGH).astype(np.int8)
     z = points.depths.astype(float)
-    good = (z >= camera.depth.nearest) & (z <= camera.depth.farthest) & (points.left_out == 0)
-    local = np.concatenate([points.rays, np.ones((len(z), 1))], axis=1)[good] * z[good, None]
-    world = local @ look.assumed[:3, :3].T + look.assumed[:3, 3]
-    cells = np.floor((world - made.origin) / made.resolution).astype(int)
-    cells = cells[((cells >= 0) & (cells < made.evidence.shape)).all(axis=1)]
-    chosen, counts = np.unique(np.ravel_multi_index(tuple(cells.T), made.evidence.shape), return_counts=True)
-    chosen = chosen[counts >= settings.least]
-    flat = made.evidence.reshape(-1)
-    flat[chosen] = np.minimum(np.maximum(flat[chosen], 0) + settings.persistence, settings.longest)
-    hits.reshape(-1)[chosen] = 1
     follow(
         made.evidence, hits, z, points.left_out, points.rays, look.assumed, made.origin, made.resolution
     )  # fmt: skip

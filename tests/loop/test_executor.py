@@ -72,7 +72,7 @@ def touched(obstacles: list[Obstacle], motion: Trajectory) -> list[float]:
     return found
 
 
-@settings(max_examples=7)
+@settings(max_examples=10)
 @given(
     st.integers(0, 10**6), st.sampled_from([0.2, 0.4, 0.8]), st.sampled_from(["still", "cv"]), st.booleans(),
     st.booleans(),

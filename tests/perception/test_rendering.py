@@ -8,9 +8,8 @@ import pinocchio as pin
 import pytest
 
 from apex_ompl.errors import MissingFileError, ParameterError
-from apex_ompl.perception.averaging import mean_frame
 from apex_ompl.perception.camera import Camera, DepthErrors, look_at
-from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.frames import Frame, mean_frame
 from apex_ompl.perception.registration import RegistrationSettings, corrected
 from apex_ompl.perception.rendering import DepthSensor, Mujoco, Part, View, ZBuffer
 from apex_ompl.perception.surfaces import RobotSurface, Surface

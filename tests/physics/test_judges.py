@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from physics import library
 from planning import cached_problem
+from small_arm import arm_problem
 
-from apex_ompl import load_problem
+from apex_ompl import load_problem, load_robot
 from apex_ompl.drivers import MujocoDriver
 from apex_ompl.drivers.grasps import GRASPING
 from apex_ompl.drivers.vessels import liquid
@@ -138,3 +140,13 @@ def test_empty_hands_reach_the_goal_without_touching_anything(robot: Robot) -> N
 @pytest.mark.parametrize("name", ["reach_past_post", "handover"])
 def test_starts_pass_as_their_own_ends(name: str, robot: Robot) -> None:
     assert Scene(robot, cached_problem(name)).failed() == set()
+
+
+def test_an_arm_without_hands_is_where_the_plan_ends(tmp_path: Path) -> None:
+    problem = arm_problem(tmp_path)
+    arm = load_robot(problem.robot)
+    driver = MujocoDriver(arm, problem)
+    for off, passed in ((0.0, True), (0.05, False)):
+        checks = Judge(problem, driver, {}, problem.start_state(arm.joint_names) + off).checks()
+        (check,) = [one for one in checks if one.name == "the robot is where the plan ends"]
+        assert check.passed is passed

@@ -13,7 +13,7 @@ from physics import library
 from planning import cached_problem
 
 from apex_ompl import plan_task
-from apex_ompl.cli import main, physics
+from apex_ompl.cli import main
 from apex_ompl.drivers import TwinSettings
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.physics import Spread, TaskRun, TaskRunner, execution
@@ -106,7 +106,7 @@ def test_objects_are_intended_where_the_plan_leaves_them(robot: Robot) -> None:
 def test_the_command_writes_log_and_film(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(physics, "SIZE", (96, 64))
+    monkeypatch.setattr("apex_ompl.cli.run.FILM_SIZE", (96, 64))
     monkeypatch.setattr(execution, "FILM_RATE", 4.0)
     log, film = tmp_path / "run.npz", tmp_path / "run.mp4"
     code = main(

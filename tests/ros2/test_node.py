@@ -319,7 +319,10 @@ def test_the_closed_loop_waits_for_what_moves(robot: Robot, stand_ins: Any, clie
     first, second = swung(robot, 0.5), swung(robot, -0.5)
     assert client.go("goal/joints", joints(robot, first)) == "reached"
     ball = Ball(robot.link_pose(robot.home, "left_hand_palm")[:3, 3])
-    look = lambda: client.publishers[topic].publish(ball.message(client, topic))  # noqa: E731
+
+    def look() -> None:
+        client.publishers[topic].publish(ball.message(client, topic))
+
     with changed(client, "closed_loop", "auto", "never"), seen_by(look, 30.0):
         time.sleep(0.3)
         count, since = len(client.outcomes), time.time_ns()

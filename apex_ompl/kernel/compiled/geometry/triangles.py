@@ -11,12 +11,10 @@ Corner = Floats | tuple[float, float, float]
 
 
 @inlined
-def squared_distance(a: Corner, b: Corner, c: Corner, x: float, y: float, z: float) -> float:
-    """Return the squared distance of a point to a triangle with given corners, shape (3,) (Ericson 2005, 5.1.5)."""
-    ax, ay, az = a[0], a[1], a[2]
-    ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
-    vx, vy, vz = c[0] - ax, c[1] - ay, c[2] - az
-    px, py, pz = x - ax, y - ay, z - az
+def closest_shares(
+    ux: float, uy: float, uz: float, vx: float, vy: float, vz: float, px: float, py: float, pz: float
+) -> tuple[float, float]:
+    """Return s and r of the point s u + r v closest to p of a triangle with a corner at 0 (Ericson 2005, 5.1.5)."""
     d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
     uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
     d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
@@ -37,6 +35,17 @@ def squared_distance(a: Corner, b: Corner, c: Corner, x: float, y: float, z: flo
     else:
         whole = va + vb + vc
         s, r = vb / whole, vc / whole
+    return s, r
+
+
+@inlined
+def squared_distance(a: Corner, b: Corner, c: Corner, x: float, y: float, z: float) -> float:
+    """Return the squared distance of a point to a triangle with given corners, shape (3,)."""
+    ax, ay, az = a[0], a[1], a[2]
+    ux, uy, uz = b[0] - ax, b[1] - ay, b[2] - az
+    vx, vy, vz = c[0] - ax, c[1] - ay, c[2] - az
+    px, py, pz = x - ax, y - ay, z - az
+    s, r = closest_shares(ux, uy, uz, vx, vy, vz, px, py, pz)
     dx, dy, dz = px - s * ux - r * vx, py - s * uy - r * vy, pz - s * uz - r * vz
     squared: float = dx * dx + dy * dy + dz * dz
     return squared

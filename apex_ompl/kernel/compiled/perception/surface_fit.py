@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined, outlined
+from apex_ompl.kernel.compiled.geometry.triangles import closest_shares
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 from apex_ompl.kernel.compiled.perception.rasterizer import draw
 from apex_ompl.kernel.compiled.perception.registration import unit_normal
@@ -125,30 +126,11 @@ def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, float]:
 
 @inlined
 def _closest(placed: Floats, a: int, b: int, c: int, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the point of a triangle that is closest to a point (Ericson 2005, 5.1.5)."""
+    """Return the point of a triangle that is closest to a point."""
     ax, ay, az = placed[a, 0], placed[a, 1], placed[a, 2]
     ux, uy, uz = placed[b, 0] - ax, placed[b, 1] - ay, placed[b, 2] - az
     vx, vy, vz = placed[c, 0] - ax, placed[c, 1] - ay, placed[c, 2] - az
-    px, py, pz = x - ax, y - ay, z - az
-    d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
-    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
-    d3, d4, d5, d6 = d1 - uu, d2 - uv, d1 - uv, d2 - vv
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    if d1 <= 0.0 and d2 <= 0.0:
-        s, r = 0.0, 0.0
-    elif d3 >= 0.0 and d4 <= d3:
-        s, r = 1.0, 0.0
-    elif d6 >= 0.0 and d5 <= d6:
-        s, r = 0.0, 1.0
-    elif vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        s, r = d1 / (d1 - d3), 0.0
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        s, r = 0.0, d2 / (d2 - d6)
-    elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
-        r = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        s = 1.0 - r
-    else:
-        s, r = vb / (va + vb + vc), vc / (va + vb + vc)
+    s, r = closest_shares(ux, uy, uz, vx, vy, vz, x - ax, y - ay, z - az)
     return ax + s * ux + r * vx, ay + s * uy + r * vy, az + s * uz + r * vz
 
 
