@@ -21,6 +21,7 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.line_query import line_query
 from apex_ompl.planning.lines import plan_along
+from apex_ompl.planning.task_constraints import StepConstraints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
@@ -101,6 +102,7 @@ class StepPlanner:
     ) -> None:
         """Plan by ``checker`` until a deadline, or until ``pressed`` holds."""
         self.checker, self.problem = checker, problem
+        self._constraints = StepConstraints(checker.robot, problem)
         self._deadline, self._pressed = deadline, pressed
 
     def _ends(self) -> bool:
@@ -129,11 +131,22 @@ class StepPlanner:
         self._deadline, found = deadline, list[StepPlan]()
         for step in steps:
             try:
-                found.append(self.plan(world, step, q, timing))
+                found.append(self._constrained(self.plan(world, step, q, timing)))
             except StepFailed as failure:
                 raise StepFailed(f"{step.title}: {failure}", f"{step.title}: {failure.cause}") from None
             world, q = found[-1].after, found[-1].end
         return found
+
+    def _constrained(self, plan: StepPlan) -> StepPlan:
+        """Return a step with the proof that the constraints hold along it.
+
+        Raises:
+            StepFailed: They do not.
+        """
+        kept = self._constraints.proved(plan.step, plan.world, plan.path.states, plan.motion)
+        if kept is not None and not kept:
+            raise StepFailed(kept.fault, kept.fault.split(" is violated")[0])
+        return plan
 
     def plan(self, world: TaskWorld, step: AnyStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a step from a state, shape (dof,).

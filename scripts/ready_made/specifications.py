@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from apex_ompl.goals.grasp import HandObjects
 from apex_ompl.problems.objects import bar, block_and_peg, boxes, cup_and_ball, parcels, two_cups
@@ -140,6 +141,20 @@ def counter() -> list[Obstacle]:
     return [Obstacle(name="wall", box=(0.7, 0.04, 0.34), position=(0.55, 0.0, 0.17)), shade]
 
 
+GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]]]] = {
+    "ball_in_cup": {"ball": ((0.028, 0.02, -0.041), (0.0, 0.0, 0.0, 1.0))},
+    "stack_boxes": {
+        "lower": ((0.0305, -0.0046, -0.0451), (0.652896, 0.328218, -0.626318, 0.271524)),
+        "upper": ((-0.0329, -0.0023, -0.0441), (-0.271131, -0.646378, -0.29065, 0.651311)),
+    },
+    "pour_upright": {
+        "left_cup": ((0.0219, -0.0202, -0.0488), (-0.310873, 0.630315, 0.387858, 0.596345)),
+        "right_cup": ((-0.0219, -0.0202, -0.0488), (0.596345, -0.387858, 0.630315, 0.310873)),
+    },
+}
+"""Poses of objects in the palms that differ from those of the suites: position [m], quaternion xyzw. The boxes and the
+cups are held by friction in them (``find_grasps.py``); the ball is between two fingers, which clear it when they open."""
+
 SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecification, ...] = (
     ReachSpecification(
         "problems/data/shelf_swap.yaml", "dual_panda_softhand", shelf,
@@ -173,7 +188,7 @@ SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecifi
         Alignment(kind="horizontal", first="cup", second="ball"),
     ),
     AlignmentSpecification(
-        "problems/data/peg_in_hole.yaml", two_walls, block_and_peg,
+        "problems/data/peg_in_hole.yaml", two_walls, partial(block_and_peg, "chamfered_block.obj"),
         Alignment(kind="horizontal", first="block", second="peg", distance=0.02),
     ),
     AlignmentSpecification(
