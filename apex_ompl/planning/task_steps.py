@@ -223,7 +223,8 @@ class StepPlanner:
             StepFailed: It is nearer than that at the start.
         """
         others = [world_geometry(body) for body in (*self.robot.fixtures, *world.scene.values())]
-        others += [(coal_geometry(o), self._pose(world, n, q)) for n, o in world.held.items() if n not in moves]
+        along = {world.held[name].link for name in moves}  # what these links hold moves along
+        others += [(coal_geometry(o), self._pose(world, n, q)) for n, o in world.held.items() if o.link not in along]
         least, request = 1.0, coal.DistanceRequest()
         for name, move in moves.items():
             shape, start, share, size = coal_geometry(world.held[name]), self._pose(world, name, q), 0.0, length(move)

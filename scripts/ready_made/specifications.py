@@ -136,9 +136,10 @@ def two_walls() -> list[Obstacle]:
 
 
 def counter() -> list[Obstacle]:
-    """A low wall between two places of a counter, and a shade that hangs over it."""
+    """A low wall between two places of a counter, a shade that hangs over it, and a stand for a tray."""
     shade = Obstacle(name="shade", cylinder={"radius": 0.12, "length": 0.2}, position=(0.5, 0.0, 0.95))
-    return [Obstacle(name="wall", box=(0.7, 0.04, 0.34), position=(0.55, 0.0, 0.17)), shade]
+    stand = Obstacle(name="stand", box=(0.16, 0.16, 0.24), position=(0.5, -0.42, 0.12))
+    return [Obstacle(name="wall", box=(0.7, 0.04, 0.34), position=(0.55, 0.0, 0.17)), shade, stand]
 
 
 GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]]]] = {
@@ -147,13 +148,14 @@ GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]
         "lower": ((0.0305, -0.0046, -0.0451), (0.652896, 0.328218, -0.626318, 0.271524)),
         "upper": ((-0.0329, -0.0023, -0.0441), (-0.271131, -0.646378, -0.29065, 0.651311)),
     },
+    "handover": {"bar": ((-0.1517, 0.0071, -0.0235), (0.706685, 0.02442, 0.698021, 0.112992))},
     "pour_upright": {
         "left_cup": ((0.0219, -0.0202, -0.0488), (-0.310873, 0.630315, 0.387858, 0.596345)),
         "right_cup": ((-0.0219, -0.0202, -0.0488), (0.596345, -0.387858, 0.630315, 0.310873)),
     },
 }
-"""Poses of objects in the palms that differ from those of the suites: position [m], quaternion xyzw. The boxes and the
-cups are held by friction in them (``find_grasps.py``); the ball is between two fingers, which clear it when they open."""
+"""Poses of objects in the palms that differ from those of the suites: position [m], quaternion xyzw. The boxes, the
+bar and the cups are held by friction in them (``find_grasps.py``); the ball is between two fingers, which clear it when they open."""
 
 SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecification, ...] = (
     ReachSpecification(
