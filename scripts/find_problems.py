@@ -186,13 +186,14 @@ def regrasped(problem: Problem) -> Problem:
     """Return a problem with the poses in :data:`GRASPS`, and with states on its constraints near its own ones."""
     robot, poses, synergies, attached = load_robot(problem.robot), GRASPS.get(problem.name, {}), {}, []
     for held in problem.attached:
-        if held.name in poses:
-            hand = next(name for name, one in robot.hands.items() if one.palm == held.link)
-            position, orientation = poses[held.name]
-            held = held.model_copy(update={"position": position, "orientation": orientation})
-            closed = grasp(robot, hand, held)
-            synergies[str(closed.synergy_joint)] = float(np.floor(closed.synergy * 1e3) / 1e3)
-        attached.append(held)
+        if held.name not in poses:
+            attached.append(held)
+            continue
+        hand = next(name for name, one in robot.hands.items() if one.palm == held.link)
+        position, orientation = poses[held.name]
+        attached.append(held.model_copy(update={"position": position, "orientation": orientation}))
+        closed = grasp(robot, hand, attached[-1])
+        synergies[str(closed.synergy_joint)] = float(np.floor(closed.synergy * 1e3) / 1e3)
     made = problem.model_copy(update={"attached": tuple(attached), "start": problem.start | synergies})
     if not poses or not problem.constraints:
         return made

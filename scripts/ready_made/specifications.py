@@ -154,8 +154,8 @@ GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]
         "right_cup": ((-0.0219, -0.0202, -0.0488), (0.596345, -0.387858, 0.630315, 0.310873)),
     },
 }
-"""Poses of objects in the palms that differ from those of the suites: position [m], quaternion xyzw. The boxes, the
-bar and the cups are held by friction in them (``find_grasps.py``); the ball is between two fingers, which clear it when they open."""
+"""Poses of objects in the palms that differ from those of the suites: position [m], quaternion xyzw. Friction holds the
+boxes, the bar and the cups in them (``find_grasps.py``); the ball is between two fingers, which open clear of it."""
 
 SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecification, ...] = (
     ReachSpecification(
