@@ -148,7 +148,6 @@ GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]
         "lower": ((0.0305, -0.0046, -0.0451), (0.652896, 0.328218, -0.626318, 0.271524)),
         "upper": ((-0.0329, -0.0023, -0.0441), (-0.271131, -0.646378, -0.29065, 0.651311)),
     },
-    "handover": {"bar": ((-0.1517, 0.0071, -0.0235), (0.706685, 0.02442, 0.698021, 0.112992))},
     "pour": {
         "empty": ((0.0227, -0.0202, -0.0484), (0.213629, -0.674368, 0.439452, 0.553599)),
         "full": ((-0.0184, -0.0208, -0.0494), (0.193693, 0.690061, -0.421072, 0.555875)),
@@ -159,7 +158,7 @@ GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]
     },
 }
 """Poses of objects in the palms that differ from those of the suites: position [m], quaternion xyzw. Friction holds the
-boxes, the bar and the cups in them (``find_grasps.py``); the ball is between two fingers, which open clear of it."""
+boxes and the cups in them (``find_grasps.py``); the ball is between two fingers, which open clear of it."""
 
 SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecification, ...] = (
     ReachSpecification(
