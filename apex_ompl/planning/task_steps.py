@@ -145,7 +145,7 @@ class StepPlanner:
         """
         kept = self._constraints.proved(plan.step, plan.world, plan.path.states, plan.motion)
         if kept is not None and not kept:
-            raise StepFailed(kept.fault, kept.fault.split(" is violated")[0])
+            raise StepFailed(kept.fault, kept.fault.split(",")[0])
         return plan
 
     def plan(self, world: TaskWorld, step: AnyStep, q: Array, timing: Timing | None) -> StepPlan:
