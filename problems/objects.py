@@ -64,10 +64,14 @@ def cup_and_ball() -> HandObjects:
     return [("left_hand", cup("cup", -1)), ("right_hand", ball)]
 
 
-def block_and_peg() -> HandObjects:
-    """Return a block with a square hole for the left hand, and a round peg for the right one."""
+def block_and_peg(mesh: str = "block.obj") -> HandObjects:
+    """Return a block with a square hole for the left hand, and a round peg for the right one.
+
+    Args:
+        mesh: File of the block.
+    """
     block = _attached(
-        name="block", link="palm", mesh={"file": str(DATA / "block.obj")}, position=(-0.03, 0.03, PALM - 0.04),
+        name="block", link="palm", mesh={"file": str(DATA / mesh)}, position=(-0.03, 0.03, PALM - 0.04),
         orientation=(0.0, -ALONG_X[1], 0.0, ALONG_X[3]), contact={"point": (0, 0, 0.035), "axis": (0, 0, 1)},
     )  # fmt: skip
     peg = _attached(

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from ready_made.meshes import block_obj, cup_obj
 from ready_made.specifications import (
+    GRASPS,
     SPECIFICATIONS,
     AlignmentSpecification,
     CarrySpecification,
@@ -27,8 +28,9 @@ from ready_made.specifications import (
 
 from apex_ompl.api import load_problem, plan
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.constraints.links import Links, in_world
-from apex_ompl.goals.grasp import HandObjects, close_hands
+from apex_ompl.goals.grasp import HandObjects, close_hands, grasp
 from apex_ompl.goals.state_sampling import scene_kernel
 from apex_ompl.kernel import offset_target, opposition_target
 from apex_ompl.ompl.setup import assemble
@@ -45,6 +47,9 @@ from apex_ompl.util.entry_point import run_script
 
 ROOT = Path(__file__).resolve().parent.parent
 MARGIN = 0.01  # [m]
+CHAMFER = 0.006, 0.01  # width and depth of that of the hole of peg_in_hole [m]
+REGRASPS, NEAR, FAR = 1000, 0.02, 1.0  # tries of a state with other grasps, and how far they are from the state [rad]
+WIDE, FROM_LIMITS = 0.02, 0.03  # of these states: clearance [m], and distance of joints from their limits [rad]
 
 
 def hold(robot: Robot, held: HandObjects) -> tuple[tuple[AttachedObject, ...], np.ndarray]:
@@ -177,6 +182,48 @@ def find_carried(specification: CarrySpecification) -> Problem:
     raise SystemExit("no pair of start and goal will do")
 
 
+def regrasped(problem: Problem) -> Problem:
+    """Return a problem with the poses in :data:`GRASPS`, and with states on its constraints near its own ones."""
+    robot, poses, synergies, attached = load_robot(problem.robot), GRASPS.get(problem.name, {}), {}, []
+    for held in problem.attached:
+        if held.name not in poses:
+            attached.append(held)
+            continue
+        hand = next(name for name, one in robot.hands.items() if one.palm == held.link)
+        position, orientation = poses[held.name]
+        attached.append(held.model_copy(update={"position": position, "orientation": orientation}))
+        closed = grasp(robot, hand, attached[-1])
+        synergies[str(closed.synergy_joint)] = float(np.floor(closed.synergy * 1e3) / 1e3)
+    made = problem.model_copy(update={"attached": tuple(attached), "start": problem.start | synergies})
+    if not poses or not problem.constraints:
+        return made
+    goals = tuple(
+        named(robot, _near_on_constraints(made, q, synergies)) for q in problem.goal_states(robot.joint_names)
+    )
+    start = named(robot, _near_on_constraints(made, problem.start_state(robot.joint_names), synergies))
+    return made.model_copy(update={"start": start, "goal": Goal(joints=goals)})
+
+
+def _near_on_constraints(problem: Problem, q: np.ndarray, synergies: dict[str, float]) -> np.ndarray:
+    """Return a free state on the constraints of a problem near a state, with these synergies."""
+    robot, rng = load_robot(problem.robot), np.random.default_rng(0)
+    hands = [robot.joint_names.index(name) for name in synergies]
+    arms = [k for k in range(robot.dof) if k not in hands]
+    q = q.copy()
+    q[hands] = list(synergies.values())
+    bound = ConstraintSet.of(robot, problem.constraints, problem.attached, q)
+    checker = CollisionChecker(robot, problem.scene, problem.attached)
+    for k in range(REGRASPS):
+        off = rng.normal(0.0, NEAR + (FAR - NEAR) * k / REGRASPS, robot.dof)
+        off[hands] = 0.0
+        found = bound.project((q + off)[None])
+        state = np.round(found.states[0], 4)
+        room = np.minimum(state - robot.limits.lower, robot.limits.upper - state)[arms].min()
+        if found.ok[0] and room > FROM_LIMITS and checker.is_free(state) and checker.clearance(state) > WIDE:
+            return state
+    raise SystemExit("no state will do with the other grasps")
+
+
 def with_relative_meshes(problem: Problem) -> Problem:
     """Return the problem with its meshes named from the folder of the file."""
 
@@ -200,16 +247,20 @@ def main() -> None:
     """Write the meshes, and find the named problems, or all."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("names", nargs="*")
-    names = parser.parse_args().names
+    parser.add_argument("--regrasp", action="store_true", help="change the grasps of the files, and search nothing")
+    given = parser.parse_args()
+    names = given.names
     (DATA / "cup.obj").write_text(cup_obj())
     (DATA / "block.obj").write_text(block_obj())
+    (DATA / "chamfered_block.obj").write_text(block_obj(chamfer=CHAMFER))
     for specification in SPECIFICATIONS:
         name = Path(specification.file).stem
         if not names or name in names:
             print(name, flush=True)
-            problem = _found(specification)
             file = ROOT / specification.file
-            after = load_problem(file).after if file.exists() else ()
+            before = load_problem(file) if file.exists() else None
+            problem = regrasped(before if given.regrasp and before else _found(specification))
+            after = before.after if before else ()
             with_relative_meshes(problem).model_copy(update={"after": after}).save(file)
 
 

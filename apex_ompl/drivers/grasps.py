@@ -58,7 +58,7 @@ class Grasps:
     Attributes:
         driver: The robot.
         found: How each object is held, the latest one last.
-        friction: Names of the objects that friction holds; others are welded.
+        friction: Names of the objects that friction holds in the hands that hold them at the start; others are welded.
     """
 
     def __init__(self, driver: MujocoDriver, friction: Collection[str] | None = None) -> None:
@@ -66,7 +66,7 @@ class Grasps:
 
         Args:
             driver: A robot whose fingers yield.
-            friction: Names of the objects that friction holds, by default all.
+            friction: Names of the objects that friction holds in these, by default all.
         """
         self.driver, self.found = driver, list[GraspFound]()
         self.friction = {one.name for one in driver.twin.held} if friction is None else set(friction)
@@ -81,13 +81,13 @@ class Grasps:
             self._press({hand for _, hand in held})
             driver.advance(driver.time + CLOSING)
         for one, hand in held:
-            self._hold(one.name, hand)
+            self._hold(one.name, hand, FRICTION if one.name in self.friction else WELD)
         for one in objects:
             if one.touch_links != () and not hands_of(driver.robot, one):
                 driver.twin.weld(driver.data, one.name, one.link)
 
     def grasp(self, name: str, hand: str, advance: Callable[[float], None] | None = None) -> None:
-        """Close a hand on an object that another one holds, or that stands somewhere, and hold it.
+        """Close a hand on an object that another one holds, or that stands somewhere, and weld it.
 
         Args:
             name: The object.
@@ -96,7 +96,7 @@ class Grasps:
         """
         self._press({hand})
         (advance or self.driver.advance)(self.driver.time + CLOSING)
-        self._hold(name, hand)
+        self._hold(name, hand, WELD)
 
     def open(self, hand: str) -> None:
         """Take the pressure from a hand that is about to open."""
@@ -120,12 +120,11 @@ class Grasps:
             driver.data.eq_active[weld] = False
         model.eq_solref[welds], model.eq_solimp[welds] = stiff
 
-    def _hold(self, name: str, hand: str) -> None:
+    def _hold(self, name: str, hand: str, kind: str) -> None:
         twin, data = self.driver.twin, self.driver.data
         links = twin.robot.hand_of(self._palm(hand))
         forces = {k: float(np.linalg.norm(f)) for k, f in twin.forces(data, name).items() if k in links}
         pressing = tuple(sorted(link for link, force in forces.items() if force > LEAST_FORCE))
-        kind = FRICTION if name in self.friction else WELD
         if len(pressing) < LEAST_LINKS and self._objects[name].links is None:
             kind = LOST
         twin.weld(data, name, self._palm(hand), active=kind == WELD)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
@@ -24,7 +25,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import fields_line
-from apex_ompl.util.validation import check_array, check_integer, check_name, check_number, finite_array
+from apex_ompl.util.validation import check_array, check_integer, check_name, check_number, check_positive, finite_array
 
 BLOCK = 500  # steps whose commands are computed at once
 MOST_STEPS = 10**7  # of one advance
@@ -229,21 +230,29 @@ class MujocoDriver:
         self._check_open()
         return self.twin.pose(self.data, name)
 
-    def picture(self, size: tuple[int, int] = (640, 480), azimuth: float = 150.0) -> Any:
+    def picture(
+        self, size: tuple[int, int] = (640, 480), azimuth: float = 150.0, center: ArrayLike = CENTER,
+        distance: float = DISTANCE,
+    ) -> Any:  # fmt: skip
         """Return a picture of the scene as it is, shape (height, width, 3), of type uint8.
 
         Args:
             size: Width and height [pixels].
             azimuth: Direction of view about the vertical axis, 180 from the front [degrees].
+            center: Point in the middle of the picture, shape (3,) [m].
+            distance: Of the camera from that point [m].
 
         Raises:
-            ParameterError: A size that is out of range.
+            ParameterError: A size or a distance that is out of range, or no point.
             MissingFileError: There is no OpenGL.
         """
         self._check_open()
         check_array(finite_array(size, "size"), (2,), "size")
         width, height = (check_integer(side, "size", 1, LARGEST_PICTURE) for side in size)
-        camera = self.twin.camera(float(finite_array(azimuth, "azimuth")), ELEVATION, DISTANCE, CENTER)
+        point = finite_array(center, "center")
+        check_array(point, (3,), "center")
+        check_positive(distance, "distance", "a positive number of meters")
+        camera = self.twin.camera(float(finite_array(azimuth, "azimuth")), ELEVATION, distance, point.tolist())
         if self._renderer is None or (self._renderer.width, self._renderer.height) != (width, height):
             self._renderer = self._new_renderer(width, height)
         self._renderer.update_scene(self.data, camera)

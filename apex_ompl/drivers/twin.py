@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations, count
 from typing import Any
@@ -64,6 +64,7 @@ class TwinSettings:
         armature: Inertia of the rotor of each joint, at the joint [kg m^2].
         damping: Viscous friction of each joint [Nm s/rad].
         friction: Coefficient of friction of all surfaces.
+        frictionless: Names of held objects without friction, such as the balls of a liquid.
         density: Density of held objects without a mass [kg/m^3].
         floor: Height of the floor, which only objects that fall can touch [m].
         finger_stiffness: Stiffness of springs by which joints that mimic others follow them, so that fingers yield to
@@ -77,6 +78,7 @@ class TwinSettings:
     armature: float = 0.1
     damping: float = 1.0
     friction: float = 0.8
+    frictionless: Collection[str] = ()
     density: float = 300.0
     floor: float = -0.75
     finger_stiffness: float | None = None
@@ -454,6 +456,8 @@ class Twin:
             geom.pos, geom.quat, geom.rgba = shape.pose[:3, 3], _quaternion(shape.pose), COLORS[role]
             geom.contype, geom.conaffinity = SOLIDS, bits
             geom.friction, geom.condim = friction, 4
+            if body.name in self.settings.frictionless:
+                geom.condim, geom.priority = 1, 1  # which counts for both bodies of a contact
             geom.solref, geom.solimp = SOFT_CONTACT["solref"], SOFT_CONTACT["solimp"]
             geom.size[: len(shape.size)] = shape.size
             if shape.vertices is not None:

@@ -97,7 +97,8 @@ class Executor:
             seed: Seed of the start, for the result.
             film: Width and height of a film [pixels].
         """
-        own = replace(settings, friction=trial.friction * settings.friction)
+        liquid = {held.name for held in trial.real.attached} - {held.name for held in trial.known.attached}
+        own = replace(settings, friction=trial.friction * settings.friction, frictionless=liquid)
         self.robot, self.trial, self.plan, self.seed, self.film = robot, trial, plan, seed, film
         self.driver = MujocoDriver(robot, trial.real, settings=own, assumed=trial.known)
         self.grasps = Grasps(self.driver, friction)

@@ -37,6 +37,7 @@ class TaskRunner:
         settings: Settings of the model.
         timeout: Of each plan [s].
         friction: Names of the objects that friction holds; by default those of a rehearsal from the problem's start.
+        executor: That of the last run, with the robot and the objects as they were at its end; None before.
     """
 
     problem: Problem
@@ -44,6 +45,7 @@ class TaskRunner:
     settings: TwinSettings = GRASPING
     timeout: float = TIMEOUT
     friction: Collection[str] | None = None
+    executor: Executor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         """Load the robot.
@@ -81,11 +83,12 @@ class TaskRunner:
             check_integer(seed, "seed", 0)
         if self.friction is None:
             self.friction = self._rehearsed()
+        self.executor = None
         trial = draw(self.robot, self.problem, seed, self.spread, self.settings.density)
         plan = self._plan(trial, seed or 0)
         if not plan or plan.trajectory is None:
             return unplanned(self.problem, seed, plan), []
-        executor = Executor(
+        executor = self.executor = Executor(
             self.robot, trial, plan, friction=self.friction, settings=self.settings, seed=seed, film=film
         )  # fmt: skip
         return executor.run(), executor.frames

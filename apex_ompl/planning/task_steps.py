@@ -21,6 +21,7 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.line_query import line_query
 from apex_ompl.planning.lines import plan_along
+from apex_ompl.planning.task_constraints import StepConstraints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
@@ -101,6 +102,7 @@ class StepPlanner:
     ) -> None:
         """Plan by ``checker`` until a deadline, or until ``pressed`` holds."""
         self.checker, self.problem = checker, problem
+        self._constraints = StepConstraints(checker.robot, problem)
         self._deadline, self._pressed = deadline, pressed
 
     def _ends(self) -> bool:
@@ -129,11 +131,22 @@ class StepPlanner:
         self._deadline, found = deadline, list[StepPlan]()
         for step in steps:
             try:
-                found.append(self.plan(world, step, q, timing))
+                found.append(self._constrained(self.plan(world, step, q, timing)))
             except StepFailed as failure:
                 raise StepFailed(f"{step.title}: {failure}", f"{step.title}: {failure.cause}") from None
             world, q = found[-1].after, found[-1].end
         return found
+
+    def _constrained(self, plan: StepPlan) -> StepPlan:
+        """Return a step with the proof that the constraints hold along it.
+
+        Raises:
+            StepFailed: They do not.
+        """
+        kept = self._constraints.proved(plan.step, plan.world, plan.path.states, plan.motion)
+        if kept is not None and not kept:
+            raise StepFailed(kept.fault, kept.fault.split(",")[0])
+        return plan
 
     def plan(self, world: TaskWorld, step: AnyStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a step from a state, shape (dof,).
@@ -210,7 +223,8 @@ class StepPlanner:
             StepFailed: It is nearer than that at the start.
         """
         others = [world_geometry(body) for body in (*self.robot.fixtures, *world.scene.values())]
-        others += [(coal_geometry(o), self._pose(world, n, q)) for n, o in world.held.items() if n not in moves]
+        along = {world.held[name].link for name in moves}  # what these links hold moves along
+        others += [(coal_geometry(o), self._pose(world, n, q)) for n, o in world.held.items() if o.link not in along]
         least, request = 1.0, coal.DistanceRequest()
         for name, move in moves.items():
             shape, start, share, size = coal_geometry(world.held[name]), self._pose(world, name, q), 0.0, length(move)

@@ -4,13 +4,18 @@ Each start is drawn by seed: joints of the arms within 0.02 rad, which are measu
 5 mm in the hands, masses and friction within 20 %. A run succeeds where the objects are where they should be
 (:mod:`apex_ompl.physics.judges`). Runs are stored in benchmarks/runs/tasks when they end; the command resumes.
 
-Usage: python -m benchmarks.physics.tasks [PROBLEM ...] [-n 40] [--report]
+With --pictures, a run that fails is drawn as it ends, from afar and near, with the reason, as FOLDER/PROBLEM.SEED.png
+(MUJOCO_GL=egl or osmesa); runs that are stored already are not drawn.
+
+Usage: python -m benchmarks.physics.tasks [PROBLEM ...] [-n 40] [--pictures FOLDER] [--report]
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
+import textwrap
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -18,10 +23,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageDraw
 from tqdm import tqdm
 
 from apex_ompl import problems
 from apex_ompl.drivers.library import mujoco
+from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.physics import Spread, TaskRunner
 from apex_ompl.physics.result import UNPLANNED, TaskRun
 from apex_ompl.problems.suite_robot import robot
@@ -34,6 +41,11 @@ from benchmarks.lib.pack import RUNS
 DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/drivers", "apex_ompl/physics")
 FOLDER = RUNS / "tasks"
 TIMEOUT = 120.0  # of a plan [s]
+VIEW, NEAR = (
+    (400, 320),
+    (200.0, 0.8),
+)  # size of each picture [pixels]; direction and distance of the near one [degrees, m]
+LINE, CHARACTER, MARGIN, COLORS = 15, 6, 8, 64  # of the text below [pixels], and number of colors
 LINKS = frozenset(robot().link_names)
 HEAD = (
     "problem", "N", "succeeded", "95 % interval", "held by", "duration s p50", "CPU s p50", "links touched obstacles",
@@ -61,8 +73,8 @@ def causes(run: TaskRun) -> list[str]:
     return [f"not: {check.name}" for check in run.checks if not check.passed]
 
 
-def stored(name: str, seeds: Sequence[int], folder: Path) -> list[dict[str, Any]]:
-    """Make the runs of a problem that are missing, and return all."""
+def stored(name: str, seeds: Sequence[int], folder: Path, pictures: Path | None = None) -> list[dict[str, Any]]:
+    """Make the runs of a problem that are missing, draw those that fail into a folder, and return all."""
     files = [folder / f"{name}.{seed}.json" for seed in seeds]
     runner = TaskRunner(problems.load(name), Spread(), timeout=TIMEOUT)
     for seed, file in zip(seeds, tqdm(files, desc=name, mininterval=10.0), strict=True):
@@ -71,8 +83,24 @@ def stored(name: str, seeds: Sequence[int], folder: Path) -> list[dict[str, Any]
         started = time.process_time()
         run, _ = runner.run(seed)
         data = row_of(run, time.process_time() - started)
+        if pictures is not None and not run and runner.executor is not None:
+            picture = drawn(runner.executor.driver, f"{name}, seed {seed}: {run.reason}")
+            write_atomically(pictures / f"{name}.{seed}.png", picture)
         write_atomically(file, (json.dumps(data, indent=1) + "\n").encode())
     return [json.loads(file.read_text()) for file in files]
+
+
+def drawn(driver: MujocoDriver, text: str) -> bytes:
+    """Return a PNG of a robot and of what is between its hands, with a text below."""
+    middle = np.mean([driver.pose(hand.palm)[:3, 3] for hand in driver.robot.hands.values()], axis=0)
+    views = np.concatenate([driver.picture(VIEW), driver.picture(VIEW, NEAR[0], middle, NEAR[1])], axis=1)
+    lines = textwrap.wrap(text, width=views.shape[1] // CHARACTER)
+    whole = Image.new("RGB", (views.shape[1], views.shape[0] + LINE * len(lines) + MARGIN), "white")
+    whole.paste(Image.fromarray(views))
+    ImageDraw.Draw(whole).text((MARGIN, views.shape[0] + MARGIN // 2), "\n".join(lines), "black")
+    buffer = io.BytesIO()
+    whole.quantize(COLORS).save(buffer, "png", optimize=True)
+    return buffer.getvalue()
 
 
 def cells(name: str, rows: Sequence[dict[str, Any]]) -> list[Any]:
@@ -96,6 +124,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("problems", nargs="*", default=list(problems.names()), help="default: all ready-made ones")
     found.add_argument("--seed", type=int, default=1, help="of the first start (default: %(default)s)")
     found.add_argument("--store", type=Path, default=FOLDER, help="folder of the runs")
+    found.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw runs that fail into it, as they end")
     found.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
     return found
 
@@ -103,7 +132,8 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Make the runs, and write the results."""
     given = parser().parse_args()
-    given.store.mkdir(parents=True, exist_ok=True)
+    for folder in filter(None, (given.store, given.pictures)):
+        folder.mkdir(parents=True, exist_ok=True)
     seeds = range(given.seed, given.seed + given.n)
     found: dict[str, list[dict[str, Any]]] = {}
     for name in given.problems:
@@ -111,7 +141,7 @@ def main() -> None:
             files = (given.store / f"{name}.{seed}.json" for seed in seeds)
             found[name] = [json.loads(file.read_text()) for file in files if file.exists()]
         else:
-            found[name] = stored(name, seeds, given.store)
+            found[name] = stored(name, seeds, given.store, given.pictures)
     found = {name: rows for name, rows in found.items() if rows}
     lines = [record.row(list(HEAD)), record.row(["---"] * len(HEAD))]
     lines += [record.row(cells(name, rows)) for name, rows in found.items()]

@@ -35,14 +35,28 @@ def _lathe(profile: Sequence[tuple[float, float]], sides: int) -> str:
     return "\n".join(lines) + "\n"
 
 
-def block_obj(edge: float = 0.08, hole: float = 0.042, depth: float = 0.07, floor: float = 0.01) -> str:
-    """Return a block with a square blind hole as OBJ text, opening towards +z, centered on the origin."""
+def block_obj(
+    edge: float = 0.08, hole: float = 0.042, depth: float = 0.07, floor: float = 0.01,
+    chamfer: tuple[float, float] = (0.0, 0.0),
+) -> str:  # fmt: skip
+    """Return a block with a square blind hole as OBJ text, opening towards +z, centered on the origin.
+
+    Args:
+        edge: Edge of its square cross-section [m].
+        hole: Edge of that of the hole [m].
+        depth: Height of the block [m].
+        floor: Thickness below the hole [m].
+        chamfer: Width and depth of the chamfer of the hole [m].
+    """
     low, high = -depth / 2, depth / 2
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
-    levels = [(edge / 2, low), (edge / 2, high), (hole / 2, high), (hole / 2, low + floor)]
+    levels = [(edge / 2, low), (edge / 2, high), (hole / 2, high - chamfer[1]), (hole / 2, low + floor)]
+    if chamfer[0] > 0.0:
+        levels.insert(2, (hole / 2 + chamfer[0], high))
     lines = [f"v {x * half:.6g} {y * half:.6g} {z:.6g}" for half, z in levels for x, y in corners]
-    lines += ["f 1 3 2", "f 1 4 3", "f 13 14 15", "f 13 15 16"]
-    for level in range(3):
+    last = 4 * (len(levels) - 1)
+    lines += ["f 1 3 2", "f 1 4 3", f"f {last + 1} {last + 2} {last + 3}", f"f {last + 1} {last + 3} {last + 4}"]
+    for level in range(len(levels) - 1):
         for k in range(4):
             a, b = 1 + 4 * level + k, 1 + 4 * level + (k + 1) % 4
             lines += [f"f {a} {b} {b + 4}", f"f {a} {b + 4} {a + 4}"]

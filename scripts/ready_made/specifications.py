@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from apex_ompl.goals.grasp import HandObjects
 from apex_ompl.problems.objects import bar, block_and_peg, boxes, cup_and_ball, parcels, two_cups
@@ -135,10 +136,29 @@ def two_walls() -> list[Obstacle]:
 
 
 def counter() -> list[Obstacle]:
-    """A low wall between two places of a counter, and a shade that hangs over it."""
+    """A low wall between two places of a counter, a shade that hangs over it, and a stand for a tray."""
     shade = Obstacle(name="shade", cylinder={"radius": 0.12, "length": 0.2}, position=(0.5, 0.0, 0.95))
-    return [Obstacle(name="wall", box=(0.7, 0.04, 0.34), position=(0.55, 0.0, 0.17)), shade]
+    stand = Obstacle(name="stand", box=(0.16, 0.16, 0.24), position=(0.5, -0.42, 0.12))
+    return [Obstacle(name="wall", box=(0.7, 0.04, 0.34), position=(0.55, 0.0, 0.17)), shade, stand]
 
+
+GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]]]] = {
+    "ball_in_cup": {"ball": ((0.028, 0.02, -0.041), (0.0, 0.0, 0.0, 1.0))},
+    "stack_boxes": {
+        "lower": ((0.0305, -0.0046, -0.0451), (0.652896, 0.328218, -0.626318, 0.271524)),
+        "upper": ((-0.0329, -0.0023, -0.0441), (-0.271131, -0.646378, -0.29065, 0.651311)),
+    },
+    "pour": {
+        "empty": ((0.0227, -0.0202, -0.0484), (0.213629, -0.674368, 0.439452, 0.553599)),
+        "full": ((-0.0184, -0.0208, -0.0494), (0.193693, 0.690061, -0.421072, 0.555875)),
+    },
+    "pour_upright": {
+        "left_cup": ((0.0219, -0.0202, -0.0488), (-0.310873, 0.630315, 0.387858, 0.596345)),
+        "right_cup": ((-0.0219, -0.0202, -0.0488), (0.596345, -0.387858, 0.630315, 0.310873)),
+    },
+}
+"""Poses of objects in the palms that differ from those of the suites: position [m], quaternion xyzw. Friction holds the
+boxes and the cups in them (``find_grasps.py``); the ball is between two fingers, which open clear of it."""
 
 SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecification, ...] = (
     ReachSpecification(
@@ -173,7 +193,7 @@ SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecifi
         Alignment(kind="horizontal", first="cup", second="ball"),
     ),
     AlignmentSpecification(
-        "problems/data/peg_in_hole.yaml", two_walls, block_and_peg,
+        "problems/data/peg_in_hole.yaml", two_walls, partial(block_and_peg, "chamfered_block.obj"),
         Alignment(kind="horizontal", first="block", second="peg", distance=0.02),
     ),
     AlignmentSpecification(

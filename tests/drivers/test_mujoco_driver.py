@@ -15,7 +15,7 @@ from apex_ompl.drivers import Driver, MujocoDriver, TwinSettings
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.robot import Robot
 from apex_ompl.robot.dynamics import Dynamics
-from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Timing, Trajectory, time_path
 
@@ -202,7 +202,38 @@ def test_a_picture_shows_the_scene(robot: Robot) -> None:
     assert picture.shape == (120, 160, 3) and picture.dtype == np.uint8
     assert 0.01 < red.mean() < 0.5
     assert driver.picture((80, 60), azimuth=30.0).shape == (60, 80, 3)
+    near = driver.picture((160, 120), center=wall.position, distance=0.8).astype(int)
+    assert (near[..., 0] - near[..., 2] > 60).mean() > 2.0 * red.mean()
     driver.close()
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_what_has_no_friction_slides_down_a_slope(robot: Robot, smooth: bool) -> None:
+    """On a slope of 0.3 rad a block of friction 0.8 stays; without friction it slides by g sin(0.3) t^2 / 2."""
+    slope, time = 0.3, 0.3
+    turn = (0.0, np.sin(slope / 2.0), 0.0, np.cos(slope / 2.0))
+    plane = Obstacle(name="plane", box=(1.0, 1.0, 0.1), position=(0.0, 0.0, 2.0), orientation=turn)
+    normal = np.array([np.sin(slope), 0.0, np.cos(slope)])
+    world = np.eye(4)
+    world[:3, :3] = [[np.cos(slope), 0.0, np.sin(slope)], [0.0, 1.0, 0.0], [-np.sin(slope), 0.0, np.cos(slope)]]
+    world[:3, 3] = np.array(plane.position) + (0.05 + 0.02) * normal
+    pose = np.linalg.inv(robot.link_pose(robot.home, "left_hand_palm")) @ world
+    block = AttachedObject.model_validate(
+        {
+            "name": "block",
+            "link": "left_hand_palm",
+            "touch_links": (),
+            "box": (0.1, 0.1, 0.04),
+            "mass": 0.1,
+            **pose_fields(pose),
+        }
+    )
+    settings = TwinSettings(finger_stiffness=0.3, frictionless=("block",) if smooth else ())
+    driver = MujocoDriver(robot, at_home(robot, plane, attached=(block,)), settings=settings)
+    driver.advance(time)
+    moved = float(np.linalg.norm(driver.pose("block")[:3, 3] - world[:3, 3]))
+    expected = 9.81 * np.sin(slope) * time**2 / 2.0 if smooth else 0.0
+    assert moved == pytest.approx(expected, rel=0.02, abs=2e-3)
 
 
 def test_bad_input_is_named(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -216,6 +247,10 @@ def test_bad_input_is_named(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> No
         driver.picture((0, 10))
     with pytest.raises(ParameterError, match="size"):
         driver.picture((10,))
+    with pytest.raises(ParameterError, match="distance"):
+        driver.picture((10, 10), distance=0.0)
+    with pytest.raises(ParameterError, match="center"):
+        driver.picture((10, 10), center=(0.0, np.nan, 0.0))
     with pytest.raises(UnknownNameError, match="no_such"):
         driver.pose("no_such")
     with pytest.raises(UnknownNameError, match="no_such"):

@@ -20,15 +20,20 @@ from apex_ompl.physics import Spread, TaskRun, TaskRunner, execution
 from apex_ompl.physics.execution import GRAVITY, STEEPEST, intended, motion_of
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.problem import Problem
 
 library()
 SECONDS = 120.0
-# Poses in which friction holds the boxes of stack_boxes, of scripts/find_grasps.py, and the synergies before contact.
-HELD_BY_FRICTION: dict[str, dict[str, Any]] = {
-    "lower": {"position": (0.0305, -0.0046, -0.0451), "orientation": (0.652896, 0.328218, -0.626318, 0.271524)},
-    "upper": {"position": (-0.0329, -0.0023, -0.0441), "orientation": (-0.271131, -0.646378, -0.29065, 0.651311)},
-}
-SYNERGIES = {"left_hand_synergy": 0.259, "right_hand_synergy": 0.284}
+# Poses of the boxes of stack_boxes that fingers press off the palms, and the synergies before contact.
+LOOSE = {"position": (0.0, 0.02, -0.044), "orientation": (0.0, 0.5**0.5, 0.0, 0.5**0.5)}
+SYNERGIES = {"left_hand_synergy": 0.101, "right_hand_synergy": 0.101}
+
+
+@cache
+def loose() -> Problem:
+    problem = cached_problem("stack_boxes")
+    held = tuple(one.model_copy(update=LOOSE) for one in problem.attached)
+    return problem.model_copy(update={"attached": held, "start": dict(problem.start) | SYNERGIES})
 
 
 @cache
@@ -40,14 +45,14 @@ def test_boxes_are_stacked_from_a_drawn_start() -> None:
     run = stacked()
     assert run and run.outcome == "DONE" and run.reason == "" and run.seed == 3
     assert [(one.object, one.hand, one.kind) for one in run.grasps] == [
-        ("lower", "left_hand", "weld"), ("upper", "right_hand", "weld"),
+        ("lower", "left_hand", "friction"), ("upper", "right_hand", "friction"),
     ]  # fmt: skip
     assert all(len(one.links) >= 2 and one.force > 0.6 for one in run.grasps)
     titles = ["goal", "line upper onto lower", "release all by right_hand", "retreat right_hand"]
     assert [title for title, _, _ in run.steps] == titles
     lower, upper = run.poses["lower"], run.poses["upper"]
     assert 0.13 < np.linalg.norm(upper[-1, :3] - lower[-1, :3]) < 0.15  # boxes of 140 mm, one on the other
-    assert np.abs(upper[-1, :3] - upper[-20, :3]).max() < 1e-4 and upper[-1, 2] > lower[-1, 2]
+    assert np.abs(upper[-1, :3] - upper[-20, :3]).max() < 1e-3 and upper[-1, 2] > lower[-1, 2]
     assert np.abs(run.measured - run.commanded)[:, :14].max() < 5e-3
 
 
@@ -58,22 +63,18 @@ def test_a_seed_is_one_run() -> None:
 
 
 def test_objects_that_nothing_holds_fall() -> None:
-    """At the problem's poses friction does not suffice, which a rehearsal finds."""
-    run, _ = TaskRunner(cached_problem("stack_boxes"), timeout=SECONDS, friction={"lower", "upper"}).run()
+    run, _ = TaskRunner(loose(), timeout=SECONDS, friction={"lower", "upper"}).run()
     assert run.outcome == "FAILED" and not run and "lower is held by left_hand: " in run.reason
     assert run.poses["lower"][-1, 2] < run.poses["lower"][0, 2] - 0.1
     assert {one.kind for one in run.grasps} == {"friction"}
 
 
-def test_boxes_are_stacked_by_friction_where_the_poses_are_good() -> None:
-    problem = cached_problem("stack_boxes")
-    held = tuple(one.model_copy(update=HELD_BY_FRICTION[one.name]) for one in problem.attached)
-    problem = problem.model_copy(update={"attached": held, "start": dict(problem.start) | SYNERGIES})
-    runner = TaskRunner(problem, timeout=SECONDS)
+def test_a_rehearsal_finds_what_needs_welds() -> None:
+    runner = TaskRunner(loose(), timeout=SECONDS)
     run, _ = runner.run()
-    assert runner.friction == {"lower", "upper"}
+    assert runner.friction == set()
     assert run, run.reason
-    assert {one.kind for one in run.grasps} == {"friction"}
+    assert {one.kind for one in run.grasps} == {"weld"}
 
 
 def test_steps_are_slow_enough_for_what_stands_and_flows(robot: Robot) -> None:
@@ -81,8 +82,8 @@ def test_steps_are_slow_enough_for_what_stands_and_flows(robot: Robot) -> None:
     plan = plan_task(problem, timeout=SECONDS)
     assert plan.trajectory is not None
     motion = motion_of(robot, problem, plan.trajectory, plan.steps[0])
-    assert motion.duration > 1.05 * plan.trajectory.duration
-    assert np.array_equal(motion.positions, plan.trajectory.positions)
+    assert motion.duration > 1.05 * plan.steps[0].end
+    assert np.array_equal(motion.positions, plan.trajectory.positions[plan.trajectory.times <= plan.steps[0].end])
     times, cargo = np.linspace(0.0, motion.duration, 300), problem.attached[1]
     places = np.array([(robot.link_pose(q, cargo.link) @ cargo.pose)[:3, 3] for q in motion(times)])
     a = np.diff(places, 2, axis=0) / (times[1] - times[0]) ** 2

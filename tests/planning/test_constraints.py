@@ -156,7 +156,7 @@ def test_a_start_off_its_constraint_has_a_status_and_a_nearest_state() -> None:
 def test_a_goal_off_its_constraint_has_a_status() -> None:
     problem = cached_problem("carry_tray")
     goal = dict(problem.goal.joints[0])  # type: ignore[index]
-    goal["left_joint2"] += 0.05
+    goal["left_joint2"] -= 0.05
     off = problem.model_copy(update={"goal": problem.goal.model_copy(update={"joints": (goal,)})})
     result = plan(off)
     assert result.status is PlanStatus.GOAL_OFF_CONSTRAINT and "closed chain of tray" in result.reason
