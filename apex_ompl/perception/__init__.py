@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
     from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
     from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
+    from apex_ompl.perception.tracking import ObstacleTracker as ObstacleTracker
+    from apex_ompl.perception.tracking import TrackedObstacle as TrackedObstacle
+    from apex_ompl.perception.tracking import TrackerSettings as TrackerSettings
     from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
 __all__, __getattr__, __dir__ = lazy_names(
@@ -50,6 +53,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",
         "synchronizer": "Synchronizer",
+        "tracking": "ObstacleTracker TrackedObstacle TrackerSettings",
         "twin_camera": "TwinCamera",
     },  # fmt: skip
 )
