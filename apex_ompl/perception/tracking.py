@@ -507,11 +507,11 @@ def _open(track: _Track, frame: CorrectedFrame, robot: Mask | None) -> bool:
     lens = lens_of(frame.camera)
     pixels = np.round(inside[:, :2] / inside[:, 2:] * lens[:2] + lens[2:]).astype(np.int64)
     height, width = frame.depth.shape
-    within = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
-    column, row = np.where(within[:, None], pixels, 0).T
+    within = np.all((pixels >= 0) & (pixels < (width, height)), axis=1, keepdims=True)
+    column, row = np.where(within, pixels, 0).T
     far = float(corners[:, 2].max())
     sight = frame.registration.pose[:3, 2]
     spread = math.sqrt(sight @ track.covariance[PLACE, PLACE] @ sight)
     depth = frame.depth if robot is None else np.where(robot, 0.0, frame.depth)
     through = depth[row, column] > far + BEHIND + 3.0 * frame.noise * far * far + spread
-    return bool(np.mean(within & through) >= 0.5)
+    return bool(np.mean(within[:, 0] & through) >= 0.5)

@@ -106,10 +106,10 @@ def _chamfer(distance: Floats) -> None:
 
 
 @inlined
-def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, float]:
-    """Return the triangle of the drawn pixel nearest to a pixel, or -1 for none within ``REACH``, and its distance."""
+def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, int, float]:
+    """Return row and column of the drawn pixel nearest to a pixel, -1 for none within ``REACH``, and its distance."""
     height, width = index.shape
-    best, found = REACH * REACH + 1, -1
+    best, line, place = REACH * REACH + 1, -1, -1
     for r in range(REACH + 1):
         if r * r >= best:
             break
@@ -120,8 +120,8 @@ def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, float]:
                 if 0 <= i < height and 0 <= j < width and index[i, j] >= 0:
                     apart = (i - row) * (i - row) + (j - column) * (j - column)
                     if apart < best:
-                        best, found = apart, index[i, j]
-    return found, math.sqrt(best)
+                        best, line, place = apart, i, j
+    return line, place, math.sqrt(best)
 
 
 @inlined
@@ -278,8 +278,8 @@ def fit_surface(
                 cross[k, m] = 0.0
         cutoff = max(last, first * 0.7**step) if step < steps else last
         cost = _add_points(
-            points, outline, lens, faces, ties, symmetry, rotation, position, settings, cutoff, placed, index, matrix,
-            vector, cross, row, camera,
+            points, outline, lens, faces, ties, symmetry, rotation, position, settings, cutoff, placed, depth, index,
+            matrix, vector, cross, row, camera,
         )  # fmt: skip
         cost += _add_contour(
             beyond, outline < len(points), lens, ties, symmetry, rotation, position, settings, depth, index, matrix,
@@ -331,7 +331,8 @@ def _move(step: Floats, rotation: Floats, position: Floats, scale: Floats, ties:
 def _add_points(
     points: Floats, outline: int, lens: Floats, faces: Integers, ties: Integers, symmetry: int, rotation: Floats,
     position: Floats, settings: tuple[float, float, float, float, float, float, float, float], cutoff: float,
-    placed: Floats, index: Integers, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+    placed: Floats, depth: Floats, index: Integers, matrix: Floats, vector: Floats, cross: Floats, row: Floats,
+    camera: Floats,
 ) -> float:  # fmt: skip
     """Add the residuals of points from the drawn surface to the normal equations, and return their cost."""
     noise, floor, edge, point_share, contour_share, _, last, reach = settings
@@ -346,9 +347,16 @@ def _add_points(
         if seen and p >= outline:
             continue
         share, largest = (point_share, cutoff) if p < outline else (contour_share, max(cutoff, reach))
-        apart = 0.0
         if inside and not seen:
-            k, apart = _seen_beside(index, line, column)
+            i, j, apart = _seen_beside(index, line, column)
+            if i >= 0:
+                k = index[i, j]
+                if p >= outline:
+                    cost += _add_uncovered(
+                        i, j, line - i, column - j, apart, lens, ties, symmetry, rotation, position, settings, largest,
+                        depth, matrix, vector, cross, row, camera,
+                    )  # fmt: skip
+                    continue
         if k < 0:
             cost += share / 3.0 * (last / (noise * z * z + floor)) ** 2
             continue
@@ -358,16 +366,11 @@ def _add_points(
             r = nx * (x - placed[a, 0]) + ny * (y - placed[a, 1]) + nz * (z - placed[a, 2])
         else:
             qx, qy, qz = _closest(placed, a, b, c, x, y, z)
-            if p >= outline:  # at the depth of the surface
-                x, y, z = x * qz / z, y * qz / z, qz
-                qx, qy, qz = _closest(placed, a, b, c, x, y, z)
             nx, ny, nz = x - qx, y - qy, z - qz
             r = math.sqrt(nx * nx + ny * ny + nz * nz)
             if r < 1e-9:
                 continue
             nx, ny, nz = nx / r, ny / r, nz / r
-            if p >= outline:  # as far as the outline is from a pixel that it covers too much
-                r = (apart - 0.5) * z / lens[0]
         cosine = (nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
         across = edge * z / lens[0]
         variance = noise * noise * z * z * z * z * cosine * cosine + floor * floor
@@ -381,6 +384,42 @@ def _add_points(
         camera[3], camera[4], camera[5], camera[6] = nx, ny, nz, nx * x + ny * y + nz * z
         _add(matrix, vector, cross, row, camera, share * weight / variance, r)
     return cost
+
+
+@inlined
+def _add_uncovered(
+    i: int, j: int, down: int, right: int, apart: float, lens: Floats, ties: Integers, symmetry: int, rotation: Floats,
+    position: Floats, settings: tuple[float, float, float, float, float, float, float, float], largest: float,
+    depth: Floats, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+) -> float:  # fmt: skip
+    """Add the residual of a pixel of the object that the drawing does not cover, and return its cost.
+
+    The drawn pixel (i, j) is the nearest, and has to move towards that pixel in the image.
+    """
+    _, floor, edge, _, share, _, _, _ = settings
+    z = depth[i, j]
+    x, y = (j - lens[2]) / lens[0] * z, (i - lens[3]) / lens[1] * z
+    pixel = z / lens[0]
+    r = (apart - 0.5) * pixel  # the border is between the centers of pixels
+    weight, loss = _robust(r, largest)
+    variance = edge * edge * pixel * pixel + floor * floor
+    if weight > 0.0:
+        gu, gv = -right / apart, -down / apart
+        _contour_row(row, camera, ties, symmetry, rotation, position, x, y, z, gu, gv)
+        _add(matrix, vector, cross, row, camera, share * weight / variance, r)
+    return share * loss * largest * largest / variance
+
+
+@inlined
+def _contour_row(
+    row: Floats, camera: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats, x: float, y: float,
+    z: float, gu: float, gv: float,
+) -> None:  # fmt: skip
+    """Set the derivatives of a residual that grows in the image along (gu, gv) with a point of the contour."""
+    gz = -(gu * x + gv * y) / z
+    _surface_row(row, rotation, position, ties, symmetry, x, y, z, gu, gv, gz)
+    camera[0], camera[1], camera[2] = -(y * gz - z * gv), -(z * gu - x * gz), -(x * gv - y * gu)
+    camera[3], camera[4], camera[5], camera[6] = -gu, -gv, -gz, 0.0
 
 
 @outlined
@@ -419,10 +458,7 @@ def _add_contour(
             cost += share * loss * reach * reach / variance
             if weight == 0.0:
                 continue
-            gz = -(gu * x + gv * y) / z
-            _surface_row(row, rotation, position, ties, symmetry, x, y, z, gu, gv, gz)
-            camera[0], camera[1], camera[2] = -(y * gz - z * gv), -(z * gu - x * gz), -(x * gv - y * gu)
-            camera[3], camera[4], camera[5], camera[6] = -gu, -gv, -gz, 0.0
+            _contour_row(row, camera, ties, symmetry, rotation, position, x, y, z, gu, gv)
             _add(matrix, vector, cross, row, camera, share * weight / variance, r)
     return cost
 
