@@ -1,0 +1,556 @@
+"""Fit of boxes and cylinders of unknown pose and size to the pixels of an obstacle.
+
+Normals of its points tell how it may be turned, and their extents its size; the fit of surfaces
+(:mod:`apex_ompl.kernel.perception`) finds pose and size. Hypotheses that differ in the length that is seen least, and
+that of a cube, are a mixture: its mean and covariance are the answer (Laplace's approximation of their evidence,
+MacKay 2003, chapter 27).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from apex_ompl.kernel.perception import AXIS, FitSettings, SurfaceFit, Window, fit_surface
+from apex_ompl.perception.color_parts import APART, BEFORE, PAD, ColorPart
+from apex_ompl.perception.library import opencv
+from apex_ompl.perception.registration import CorrectedFrame
+from apex_ompl.perception.rendering import lens_of
+from apex_ompl.perception.surfaces import Surface, body_surface
+from apex_ompl.scene.bodies import Body
+from apex_ompl.types import Array, Indices
+
+Mask = NDArray[np.bool_]
+Kind = Literal["box", "cylinder"]
+
+COARSE, FINE = 45, 90  # width or height of windows [pixels]
+COARSE_POINTS = 120
+COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at most
+COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 8, 6, 4
+SCREENED = 3  # starts from which fits are made
+NORMALS = 150  # that are compared at most
+SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
+SQUARE = 0.5  # cosine between normals of different sides
+THICK = 0.012  # distance from a plane of its points [m]
+PAIRS = 60  # of normals whose common perpendicular may be an axis
+DEPTHS = (0.6, 1.0, 1.6)  # lengths along the line of sight that are tried, over the mean of the others
+PROFILE = 9  # lengths of the mixture
+VAGUE = 0.06  # standard deviation of the logarithm of a length above which it has a mixture of its own
+KNOWN = 1e8  # information of what is no unknown
+HELD = 1e6  # of the logarithm of a length that is held
+MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
+PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
+SLICES = 32
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much measurements say; as in :class:`apex_ompl.perception.obstacles.ObstacleSettings`."""
+
+    floor: float
+    edge: float
+    point_share: float
+    contour_share: float
+    inflation: float
+    most_points: int
+    smallest: float
+    largest: float
+    cubes: float
+
+
+@dataclass(frozen=True, eq=False)
+class KnownSize:
+    """The size of an obstacle that is known before it is seen.
+
+    Attributes:
+        kind: ``box`` or ``cylinder`` along z.
+        size: Lengths along its axes, of a cylinder diameter, diameter and length, shape (3,) [m].
+        spread: Standard deviation of each length [m].
+    """
+
+    kind: Kind
+    size: Array
+    spread: float = 0.001
+
+
+class Solid(NamedTuple):
+    """A solid: its kind, lengths, shape (3,) [m], and pose in the optical frame, shape (4, 4) [m]."""
+
+    kind: Kind
+    size: Array
+    pose: Array
+
+
+class Estimate(NamedTuple):
+    """A solid with the covariance of turn, shift and logarithms of lengths in the optical frame, shape (9, 9)."""
+
+    solid: Solid
+    covariance: Array
+
+
+class Level(NamedTuple):
+    """The pixels of an obstacle at a resolution.
+
+    Attributes:
+        window: The window.
+        points: Measured points in the optical frame, then points at the border, or whose depths are their neighbors',
+            shape (N, 3) [m].
+        measured: Number of measured points.
+        beyond: Distances of pixels from those that it may cover, shape (h, w) [pixels of the window].
+        lens: Lens of the window.
+        settings: Weights of a fit.
+    """
+
+    window: Window
+    points: Array
+    measured: int
+    beyond: Array
+    lens: Array
+    settings: FitSettings
+
+
+class Patch(NamedTuple):
+    """The pixels of an obstacle.
+
+    Attributes:
+        coarse: For the search.
+        fine: For the answer.
+        extent: Points, those at the border with guessed depths, shape (M, 3) [m].
+        places: Smoothed points of its surface, shape (K, 3) [m].
+        normals: Normals there, shape (K, 3).
+        cut: Whether the image cuts it.
+        pixels: Number of pixels with depth.
+    """
+
+    coarse: Level
+    fine: Level
+    extent: Array
+    places: Array
+    normals: Array
+    cut: bool
+    pixels: int
+
+
+class _Found(NamedTuple):
+    """A fit from a start."""
+
+    start: Solid
+    fit: SurfaceFit
+    prior: Array
+
+    @property
+    def solid(self) -> Solid:
+        """The solid that was found."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.fit.rotation, self.fit.position
+        return Solid(self.start.kind, self.start.size * self.fit.scale, pose)
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the evidence by Laplace's approximation."""
+        spread = np.linalg.slogdet(self.fit.information)[1] - np.linalg.slogdet(self.prior)[1]
+        return -(self.fit.cost + float(spread)) / 2.0
+
+
+def patch_of(part: ColorPart, seen: CorrectedFrame, weights: Weights, least: int) -> Patch | None:
+    """Return the pixels of a part; None where fewer than ``least`` have a depth."""
+    cv, camera = opencv(), seen.camera
+    rows, columns = np.flatnonzero(part.own.any(axis=1)), np.flatnonzero(part.own.any(axis=0))
+    if not len(rows):
+        return None
+    bottom, right = rows[-1] + part.top, columns[-1] + part.left
+    top, left = rows[0] + part.top, columns[0] + part.left
+    cut = top < 2 or left < 2 or bottom > camera.height - 3 or right > camera.width - 3
+    crop = slice(max(0, rows[0] - PAD), rows[-1] + PAD + 1), slice(max(0, columns[0] - PAD), columns[-1] + PAD + 1)
+    own, guess = part.own[crop], part.filled[crop]
+    corner = part.top + crop[0].start, part.left + crop[1].start
+    depth = seen.depth[corner[0] : corner[0] + own.shape[0], corner[1] : corner[1] + own.shape[1]]
+    measured = own & (depth > 0.0) & (np.abs(depth - guess) < APART)
+    pixels = int(np.count_nonzero(measured))
+    if pixels < least:
+        return None
+    inner = cv.erode(own.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1) > 0
+    sure = measured & inner  # depths at the border are often wrong
+    if np.count_nonzero(sure) < least:
+        sure = measured
+    covered = own | ((depth > 0.0) & (depth < guess - BEFORE))
+    lens = lens_of(camera)
+
+    def level(size: int, most: int, most_guessed: int) -> tuple[Level, Array]:
+        stride = -(-max(own.shape) // size)
+        height, width = own.shape[0] // stride, own.shape[1] // stride
+        window = Window(int(corner[1]), int(corner[0]), width, height, stride)
+        cells = slice(0, height * stride, stride), slice(0, width * stride, stride)
+        own_lens = window.lens(lens)
+        beyond = cv.distanceTransform((~covered[cells]).astype(np.uint8), cv.DIST_L2, 5).astype(float)
+        good, all_good = sure[cells], own[cells]
+        points, guessed = _points(guess[cells], good, own_lens), _points(guess[cells], all_good & ~good, own_lens)
+        kept = points[_spaced(len(points), most)]
+        settings = _fit_settings(weights, stride, len(points) / max(len(kept), 1), seen)
+        every = np.concatenate([kept, guessed[_spaced(len(guessed), most_guessed)]])
+        return Level(window, every, len(kept), beyond, own_lens, settings), np.concatenate([points, guessed])
+
+    fine, _ = level(FINE, weights.most_points, FINE_GUESSED)
+    coarse, extent = level(COARSE, COARSE_POINTS, COARSE_GUESSED)
+    stride = coarse.window.stride
+    grid = _grid(guess[::stride, ::stride], Window(corner[1], corner[0], 0, 0, stride).lens(lens))
+    places, normals = _normals(grid, measured[::stride, ::stride])
+    return Patch(coarse, fine, extent, places, normals, bool(cut), pixels)
+
+
+def _fit_settings(weights: Weights, stride: int, thinning: float, seen: CorrectedFrame) -> FitSettings:
+    shared = max(1.0, (seen.camera.depth.correlation / stride) ** 2)
+    return FitSettings(
+        noise=seen.noise, floor=weights.floor, edge=weights.edge,
+        point_share=weights.point_share * thinning / shared / weights.inflation,
+        contour_share=weights.contour_share * stride / weights.inflation, first=0.04, last=0.02, reach=0.02,
+        steps=FINE_STEPS,
+    )  # fmt: skip
+
+
+def _spaced(count: int, most: int) -> Indices:
+    """Return up to ``most`` numbers below ``count``, equally spaced."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+
+
+def _points(depth: Array, chosen: Mask, lens: Array) -> Array:
+    """Return the points of chosen pixels of a depth image in the optical frame, shape (N, 3) [m]."""
+    rows, columns = np.nonzero(chosen)
+    z = depth[rows, columns]
+    return np.stack([(columns - lens[2]) / lens[0] * z, (rows - lens[3]) / lens[1] * z, z], axis=-1)
+
+
+def _grid(depth: Array, lens: Array) -> Array:
+    """Return the points of a depth image in the optical frame, shape (h, w, 3) [m]."""
+    rows, columns = np.ogrid[0 : depth.shape[0], 0 : depth.shape[1]]
+    return np.stack([(columns - lens[2]) / lens[0] * depth, (rows - lens[3]) / lens[1] * depth, depth], axis=-1)
+
+
+def _normals(grid: Array, measured: Mask) -> tuple[Array, Array]:
+    """Return smoothed points and normals there by differences over a distance of pixels, both of shape (K, 3)."""
+    cv, r = opencv(), max(2, round(np.sqrt(np.count_nonzero(measured)) / 6.0))
+    weight = measured.astype(float)
+    share = cv.blur(weight, (r, r), borderType=cv.BORDER_CONSTANT)
+    smooth = cv.blur(grid * weight[..., None], (r, r), borderType=cv.BORDER_CONSTANT)
+    smooth /= np.maximum(share, 1e-9)[..., None]
+    good = share > 0.6
+    if min(good.shape) <= 2 * r:
+        return np.empty((0, 3)), np.empty((0, 3))
+    inner = good[2 * r :, r:-r] & good[: -2 * r, r:-r] & good[r:-r, 2 * r :] & good[r:-r, : -2 * r]
+    rows, columns = np.nonzero(inner)
+    step = max(1, len(rows) // NORMALS)
+    rows, columns = rows[::step] + r, columns[::step] + r
+    down = smooth[rows + r, columns] - smooth[rows - r, columns]
+    across = smooth[rows, columns + r] - smooth[rows, columns - r]
+    normals = np.cross(down, across)
+    normals /= np.maximum(np.sqrt((normals * normals).sum(axis=1, keepdims=True)), 1e-12)
+    return smooth[rows, columns], np.asarray(normals)
+
+
+def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence[KnownSize] = ()) -> Estimate | None:
+    """Return the solid of a patch; None where no fit found any.
+
+    Args:
+        patch: Its pixels.
+        seen: The frame.
+        weights: How much measurements say.
+        known: Sizes that it may have, or others.
+    """
+    best = _searched(patch)
+    if best is None:
+        return None
+    misfit = max(1.0, best.fit.cost / (patch.fine.settings.point_share * patch.fine.measured) / MISFIT)
+    sized = _of_known_size(best, patch, known)
+    if sized is not None:
+        return _estimate(sized, misfit, seen)
+    parts = [(best.evidence, _estimate(best, misfit, seen))]
+    axis = _vague_axis(parts[0][1])
+    if axis is not None:
+        parts = _profile(best, axis, misfit, patch, seen, weights)
+    if best.start.kind == "box" and weights.cubes > 0.0:
+        parts = _with_cube(best, parts, misfit, patch, seen, weights)
+    return _mixture(parts)
+
+
+def _searched(patch: Patch) -> _Found | None:
+    """Return the best fit from all starts."""
+    starts = _starts(patch)
+    screened = sorted(((_run(one, patch.coarse, 0).fit.cost, k) for k, one in enumerate(starts)))
+    chosen = [k for _, k in screened[:SCREENED]]
+    for kind in ("box", "cylinder"):
+        if all(starts[k].kind != kind for k in chosen):
+            chosen += [k for _, k in screened if starts[k].kind == kind][:1]
+    found = [_run(starts[k], patch.coarse, COARSE_STEPS) for k in chosen]
+    found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
+    if not found:
+        return None
+    other = [one for one in found[1:] if one.start.kind != found[0].start.kind]
+    rivals = [found[0], *(one for one in other[:1] if one.fit.cost < 1.5 * found[0].fit.cost)]
+    refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals]
+    refined = [one for one in refined if np.isfinite(one.fit.cost)]
+    return min(refined, key=lambda one: one.fit.cost) if refined else None
+
+
+def _run(
+    start: Solid, level: Level, steps: int, prior: Array | None = None, ties: tuple[int, int, int] | None = None
+) -> _Found:
+    """Return the fit from a start."""
+    surface = _unit(start.kind)
+    symmetry = 0 if start.kind == "box" else AXIS
+    tied = np.array(ties if ties is not None else (0, 1, 2) if start.kind == "box" else (0, 0, 2))
+    before = _prior(start.kind) if prior is None else prior
+    s = level.settings
+    settings = FitSettings(
+        s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first if steps else 0.06, s.last if steps else 0.06,
+        s.reach, steps,
+    )  # fmt: skip
+    fit = fit_surface(
+        level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry, start.pose,
+        start.pose, before, settings, level.measured,
+    )  # fmt: skip
+    return _Found(start, fit, before)
+
+
+def _prior(kind: Kind) -> Array:
+    """Return the information before a fit, shape (9, 9)."""
+    prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
+    if kind == "cylinder":  # both diameters are one unknown
+        prior[7, 7] = KNOWN
+    return prior
+
+
+@cache
+def _unit(kind: Kind) -> Surface:
+    """Return the surface of a solid whose lengths are 1 m."""
+    shape: dict[str, object] = {"box": (1.0, 1.0, 1.0)}
+    if kind == "cylinder":
+        shape = {"cylinder": {"radius": 0.5, "length": 1.0}}
+    return body_surface(Body.model_validate({"name": "obstacle", **shape}), SLICES)
+
+
+def _estimate(found: _Found, factor: float, seen: CorrectedFrame, shift: Array | None = None) -> Estimate:
+    """Return the solid that was found with its covariance; variances of measurements grow by a factor."""
+    own = np.linalg.inv(found.prior + (found.fit.information - found.prior) / factor)
+    lever = own @ found.fit.cross / factor
+    return Estimate(found.solid, own + lever @ seen.registration.covariance @ lever.T)
+
+
+def _vague_axis(one: Estimate) -> int | None:
+    """Return the axis whose length is least known, or None where all are known."""
+    spread = np.sqrt(np.diag(one.covariance)[6:])
+    if one.solid.kind == "cylinder":
+        spread[1] = 0.0
+    axis = int(np.argmax(spread * one.solid.size))
+    return axis if spread[axis] > VAGUE else None
+
+
+def _resized(solid: Solid, axis: int, length: float) -> Solid:
+    """Return a solid with another length along an axis, the end that faces the camera where it was."""
+    pose, size = solid.pose.copy(), solid.size.copy()
+    away = np.sign(pose[:3, axis] @ pose[:3, 3])
+    pose[:3, 3] += away * (length - size[axis]) / 2.0 * pose[:3, axis]
+    size[axis] = length
+    if solid.kind == "cylinder" and axis < 2:
+        size[:2] = length
+    return Solid(solid.kind, size, pose)
+
+
+def _profile(
+    best: _Found, axis: int, factor: float, patch: Patch, seen: CorrectedFrame, weights: Weights
+) -> list[tuple[float, Estimate]]:  # fmt: skip
+    """Return hypotheses of a length that is not known, with the logarithms of their evidence."""
+    solid = best.solid
+    lengths = np.geomspace(0.5 * weights.smallest, weights.largest, PROFILE)
+    step = float(np.log(lengths[1] / lengths[0]))
+    middle = float(np.log(np.delete(solid.size, axis)).mean())
+    prior = _prior(solid.kind)
+    prior[6 + axis, 6 + axis] = HELD
+    found = []
+    for length in lengths:
+        one = _run(_resized(solid, axis, float(length)), patch.coarse, PROFILE_STEPS, prior)
+        if not np.isfinite(one.fit.cost):
+            continue
+        off = (np.log(length) - middle) / SIZE
+        density = -off * off / 2.0 - np.log(SIZE * np.sqrt(2.0 * np.pi)) + np.log(step)
+        estimate = _estimate(one, factor, seen)
+        spread = estimate.covariance.copy()
+        spread[6 + axis, 6 + axis] += step * step / 12.0  # of lengths between two
+        lever = np.zeros(9)
+        lever[3:6] = 0.5 * solid.pose[:3, axis] * np.sign(solid.pose[:3, axis] @ solid.pose[:3, 3]) * length
+        lever[6 + axis] = 1.0
+        spread = estimate.covariance + step * step / 12.0 * np.outer(lever, lever)
+        found.append((one.evidence + float(density), Estimate(estimate.solid, spread)))
+    return found
+
+
+def _with_cube(
+    best: _Found, parts: list[tuple[float, Estimate]], factor: float, patch: Patch, seen: CorrectedFrame,
+    weights: Weights,
+) -> list[tuple[float, Estimate]]:  # fmt: skip
+    """Return hypotheses with that of a cube."""
+    return parts
+
+
+def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _Found | None:
+    """Return the best fit of a known size, or None where none fits."""
+    return None
+
+
+def _mixture(parts: list[tuple[float, Estimate]]) -> Estimate | None:
+    """Return the mean and the covariance of hypotheses; turns are those of the most likely one."""
+    if not parts:
+        return None
+    evidence = np.array([one for one, _ in parts])
+    weight = np.exp(evidence - evidence.max())
+    weight /= weight.sum()
+    best = parts[int(np.argmax(weight))][1].solid
+    means = np.array(
+        [
+            [*pin.log3(one.solid.pose[:3, :3] @ best.pose[:3, :3].T), *one.solid.pose[:3, 3], *one.solid.size]
+            for _, one in parts
+        ]
+    )
+    mean = weight @ means
+    covariance = np.zeros((9, 9))
+    for share, value, (_, one) in zip(weight, means, parts, strict=True):
+        scale = np.concatenate([np.ones(6), one.solid.size])
+        off = value - mean
+        covariance += share * (one.covariance * np.outer(scale, scale) + np.outer(off, off))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = pin.exp3(mean[:3]) @ best.pose[:3, :3], mean[3:6]
+    scale = np.concatenate([np.ones(6), 1.0 / mean[6:]])
+    return Estimate(Solid(best.kind, mean[6:], pose), covariance * np.outer(scale, scale))
+
+
+def _plane(places: Array, normals: Array) -> Array | None:
+    """Return the normal of the plane through the places of the largest group of like normals; None without normals."""
+    if not len(normals):
+        return None
+    alike = normals @ normals.T > SAME_WAY
+    group = alike[int(np.argmax(alike.sum(axis=1)))]
+    mean = normals[group].mean(axis=0)
+    mean /= np.sqrt(mean @ mean)
+    for _ in range(2):
+        height = places @ mean
+        near = group & (np.abs(height - np.median(height[group])) < THICK)
+        if np.count_nonzero(near) < 6:
+            break
+        own = places[near] - places[near].mean(axis=0)
+        found = np.linalg.eigh(own.T @ own)[1][:, 0]
+        mean = found * np.sign(found @ mean)
+    return np.asarray(mean)
+
+
+def _round_axis(normals: Array) -> Array | None:
+    """Return the axis to which most normals are perpendicular or, those of a cap, parallel (RANSAC); None for few."""
+    if len(normals) < 8:
+        return None
+    rng = np.random.default_rng(0)
+    pairs = rng.integers(len(normals), size=(PAIRS, 2))
+    axes = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+    lengths = np.sqrt((axes * axes).sum(axis=1))
+    if not (lengths > 0.3).any():
+        return None
+    axes = axes[lengths > 0.3] / lengths[lengths > 0.3, None]
+    along = np.abs(normals @ axes.T)
+    best = int(np.argmax((along < 0.2).sum(axis=0) + (along > 0.95).sum(axis=0)))
+    side = normals[along[:, best] < 0.25]
+    return np.asarray(np.linalg.eigh(side.T @ side)[1][:, 0])
+
+
+def _starts(patch: Patch) -> list[Solid]:
+    """Return boxes and cylinders from which fits start, in the optical frame."""
+    first = _plane(patch.places, patch.normals)
+    if first is None:
+        first = -np.median(patch.extent, axis=0)
+        first /= np.sqrt(first @ first)
+    rest = np.abs(patch.normals @ first) < SQUARE
+    enough = np.count_nonzero(rest) > max(3.0, 0.06 * len(patch.normals))
+    second = _plane(patch.places[rest], patch.normals[rest]) if enough else None
+    frames = [_frame(first, second if second is not None else _longest(patch.extent, first))]
+    if second is None:  # one side is seen, or a round one
+        frames += [_turned(frames[0], np.pi / 4.0), _squared(patch.extent, first)]
+    starts = [one for frame in frames for one in _boxes(frame, patch)]
+    axes = [first] if second is None else [first, second]
+    round_one = _round_axis(patch.normals)
+    if round_one is not None:
+        axes.append(round_one)
+    return starts + [one for axis in axes for one in _cylinders(axis, patch)]
+
+
+def _frame(first: Array, second: Array) -> Array:
+    """Return a rotation whose x is the first vector and whose y is in the plane of both."""
+    y = second - (second @ first) * first
+    y /= np.sqrt(y @ y)
+    return np.stack([first, y, np.cross(first, y)], axis=1)
+
+
+def _turned(frame: Array, angle: float) -> Array:
+    """Return a rotation turned about its x [rad]."""
+    return np.asarray(frame @ pin.exp3(np.array([angle, 0.0, 0.0])))
+
+
+def _longest(points: Array, normal: Array) -> Array:
+    """Return the direction across a normal in which points extend most."""
+    flat = points - points.mean(axis=0)
+    flat = flat - (flat @ normal)[:, None] * normal
+    return np.asarray(np.linalg.eigh(flat.T @ flat)[1][:, 2])
+
+
+def _squared(points: Array, normal: Array) -> Array:
+    """Return the rotation whose x is a normal, along the sides of the smallest rectangle around points across it."""
+    y = _longest(points, normal)
+    z = np.cross(normal, y)
+    flat = np.stack([points @ y, points @ z], axis=-1).astype(np.float32)
+    angle = np.radians(opencv().minAreaRect(flat)[2])
+    return _frame(normal, np.cos(angle) * y + np.sin(angle) * z)
+
+
+def _boxes(frame: Array, patch: Patch) -> list[Solid]:
+    """Return boxes of the points' extents, and deeper ones along the line of sight, their fronts the same."""
+    along = patch.extent @ frame
+    low, high = np.percentile(along, [1.0, 99.0], axis=0)
+    size = np.maximum(high - low, 0.01)
+    solid = _solid("box", size, frame, (high + low) / 2.0)
+    return _deeper(solid, 0)
+
+
+def _deeper(solid: Solid, axis: int) -> list[Solid]:
+    """Return a solid and deeper ones along an axis."""
+    others = float(np.delete(solid.size, axis).mean())
+    lengths = [share * others for share in DEPTHS if share * others > 1.15 * solid.size[axis]]
+    return [solid, *(_resized(solid, axis, length) for length in lengths)]
+
+
+def _cylinders(axis: Array, patch: Patch) -> list[Solid]:
+    """Return cylinders along an axis whose outline and front are those of the points."""
+    points = patch.extent
+    sight = points.mean(axis=0)
+    across = np.cross(axis, sight)
+    seen_end = float(np.abs(axis @ sight) / np.sqrt(sight @ sight))  # cosine
+    if across @ across < 0.0004 * (sight @ sight):  # along the line of sight
+        across = _longest(points, axis)
+    across /= np.sqrt(across @ across)
+    frame = np.stack([across, np.cross(axis, across), axis], axis=1)
+    along = points @ frame
+    low, high = np.percentile(along, [1.0, 99.0], axis=0)
+    size, middle = np.maximum(high - low, 0.01), (high + low) / 2.0
+    away = frame.T @ sight
+    radius = float(size[0]) / 2.0
+    if seen_end < 0.8 and size[2] > 0.4 * radius:
+        middle[1] = low[1] + radius if away[1] > 0.0 else high[1] - radius
+    solid = _solid("cylinder", np.array([2.0 * radius, 2.0 * radius, size[2]]), frame, middle)
+    return _deeper(solid, 2) if seen_end > 0.6 else [solid]
+
+
+def _solid(kind: Kind, size: Array, frame: Array, middle: Array) -> Solid:
+    pose = np.eye(4)
+    pose[:3, :3] = frame if np.linalg.det(frame) > 0.0 else frame * (1.0, 1.0, -1.0)
+    pose[:3, 3] = frame @ middle
+    return Solid(kind, np.maximum(size, 0.01), pose)
