@@ -32,15 +32,15 @@ Kind = Literal["box", "cylinder"]
 COARSE, FINE = 45, 90  # width or height of windows [pixels]
 COARSE_POINTS = 120
 COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at most
-COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 8, 6, 4
-SCREENED = 3  # starts from which fits are made
+COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 6, 6, 3
+RIVALS, RIVAL = 3, 1.3  # fits that are refined at most, and their largest cost over the least
 NORMALS = 150  # that are compared at most
 SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
 SQUARE = 0.5  # cosine between normals of different sides
 THICK = 0.012  # distance from a plane of its points [m]
 PAIRS = 60  # of normals whose common perpendicular may be an axis
-DEPTHS = (0.6, 1.0, 1.6)  # lengths along the line of sight that are tried, over the mean of the others
-PROFILE = 9  # lengths of the mixture
+FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
+RATIO, UNLIKELY, MOST_LENGTHS = 1.25, 14.0, 8  # of lengths of the mixture; cost above the least where they end; number
 VAGUE = 0.06  # standard deviation of the logarithm of a length above which it has a mixture of its own
 KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
@@ -143,6 +143,7 @@ class _Found(NamedTuple):
     start: Solid
     fit: SurfaceFit
     prior: Array
+    unknowns: list[int]  # of turn, shift and each length
 
     @property
     def solid(self) -> Solid:
@@ -272,26 +273,24 @@ def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence
     parts = [(best.evidence, _estimate(best, misfit, seen))]
     axis = _vague_axis(parts[0][1])
     if axis is not None:
-        parts = _profile(best, axis, misfit, patch, seen, weights)
+        held, evidence = _profile(best, axis, patch, weights)
+        if len(held) > 1:
+            held_parts = [_between(_estimate(one, misfit, seen), axis) for one in held]
+            parts = list(zip(evidence.tolist(), held_parts, strict=True))
     if best.start.kind == "box" and weights.cubes > 0.0:
-        parts = _with_cube(best, parts, misfit, patch, seen, weights)
+        cube = _cube(best, patch)
+        parts = [(one + float(np.log(1.0 - weights.cubes)), solid) for one, solid in parts]
+        parts.append((cube.evidence + float(np.log(weights.cubes)), _estimate(cube, misfit, seen)))
     return _mixture(parts)
 
 
 def _searched(patch: Patch) -> _Found | None:
     """Return the best fit from all starts."""
-    starts = _starts(patch)
-    screened = sorted(((_run(one, patch.coarse, 0).fit.cost, k) for k, one in enumerate(starts)))
-    chosen = [k for _, k in screened[:SCREENED]]
-    for kind in ("box", "cylinder"):
-        if all(starts[k].kind != kind for k in chosen):
-            chosen += [k for _, k in screened if starts[k].kind == kind][:1]
-    found = [_run(starts[k], patch.coarse, COARSE_STEPS) for k in chosen]
+    found = [_run(one, patch.coarse, COARSE_STEPS) for one in _starts(patch)]
     found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
     if not found:
         return None
-    other = [one for one in found[1:] if one.start.kind != found[0].start.kind]
-    rivals = [found[0], *(one for one in other[:1] if one.fit.cost < 1.5 * found[0].fit.cost)]
+    rivals = [found[0], *(one for one in found[1:RIVALS] if one.fit.cost < RIVAL * found[0].fit.cost)]
     refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals]
     refined = [one for one in refined if np.isfinite(one.fit.cost)]
     return min(refined, key=lambda one: one.fit.cost) if refined else None
@@ -307,14 +306,13 @@ def _run(
     before = _prior(start.kind) if prior is None else prior
     s = level.settings
     settings = FitSettings(
-        s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first if steps else 0.06, s.last if steps else 0.06,
-        s.reach, steps,
+        s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach, steps
     )  # fmt: skip
     fit = fit_surface(
         level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry, start.pose,
         start.pose, before, settings, level.measured,
     )  # fmt: skip
-    return _Found(start, fit, before)
+    return _Found(start, fit, before, [*range(6), *(6 + tied)])
 
 
 def _prior(kind: Kind) -> Array:
@@ -334,20 +332,29 @@ def _unit(kind: Kind) -> Surface:
     return body_surface(Body.model_validate({"name": "obstacle", **shape}), SLICES)
 
 
-def _estimate(found: _Found, factor: float, seen: CorrectedFrame, shift: Array | None = None) -> Estimate:
+def _estimate(found: _Found, factor: float, seen: CorrectedFrame) -> Estimate:
     """Return the solid that was found with its covariance; variances of measurements grow by a factor."""
     own = np.linalg.inv(found.prior + (found.fit.information - found.prior) / factor)
     lever = own @ found.fit.cross / factor
-    return Estimate(found.solid, own + lever @ seen.registration.covariance @ lever.T)
+    covariance = own + lever @ seen.registration.covariance @ lever.T
+    return Estimate(found.solid, covariance[np.ix_(found.unknowns, found.unknowns)])
 
 
 def _vague_axis(one: Estimate) -> int | None:
-    """Return the axis whose length is least known, or None where all are known."""
+    """Return the axis whose length is least known, or None where all are known.
+
+    It is that of the side that is seen most, where this is most of what is seen.
+    """
+    solid, sight = one.solid, one.solid.pose[:3, 3]
+    area = np.abs(solid.pose[:3, :3].T @ sight) * np.prod(solid.size) / solid.size
+    if solid.kind == "cylinder":
+        around = float(np.hypot(area[0], area[1]))
+        return 2 if area[2] * np.pi / 4.0 > FRONT * (area[2] * np.pi / 4.0 + around) else None
+    axis = int(np.argmax(area))
     spread = np.sqrt(np.diag(one.covariance)[6:])
-    if one.solid.kind == "cylinder":
-        spread[1] = 0.0
-    axis = int(np.argmax(spread * one.solid.size))
-    return axis if spread[axis] > VAGUE else None
+    if area[axis] > FRONT * area.sum():
+        return axis
+    return int(np.argmax(spread)) if spread.max() > VAGUE else None
 
 
 def _resized(solid: Solid, axis: int, length: float) -> Solid:
@@ -361,40 +368,56 @@ def _resized(solid: Solid, axis: int, length: float) -> Solid:
     return Solid(solid.kind, size, pose)
 
 
-def _profile(
-    best: _Found, axis: int, factor: float, patch: Patch, seen: CorrectedFrame, weights: Weights
-) -> list[tuple[float, Estimate]]:  # fmt: skip
-    """Return hypotheses of a length that is not known, with the logarithms of their evidence."""
-    solid = best.solid
-    lengths = np.geomspace(0.5 * weights.smallest, weights.largest, PROFILE)
-    step = float(np.log(lengths[1] / lengths[0]))
-    middle = float(np.log(np.delete(solid.size, axis)).mean())
-    prior = _prior(solid.kind)
+def _profile(best: _Found, axis: int, patch: Patch, weights: Weights) -> tuple[list[_Found], Array]:
+    """Return fits with lengths along an axis that are held, and the logarithms of their evidence.
+
+    Lengths grow and fall from the best one by a ratio until their costs are too large.
+    """
+    first = best.solid.size[axis]
+    middle = float(np.log(np.delete(best.solid.size, axis)).mean())
+    least = best.fit.cost
+    found: list[_Found] = []
+    for ratio in (RATIO, 1.0 / RATIO):
+        solid, length = best.solid, first * (1.0 if ratio > 1.0 else ratio)
+        for _ in range(MOST_LENGTHS):
+            if not 0.5 * weights.smallest < length < weights.largest:
+                break
+            one = _held(_resized(solid, axis, length), axis, patch.fine)
+            if not one.fit.cost < least + UNLIKELY:
+                break
+            found.append(one)
+            solid, least, length = one.solid, min(least, one.fit.cost), length * ratio
+    lengths = np.array([one.solid.size[axis] for one in found])
+    off = (np.log(lengths) - middle) / SIZE
+    density = -off * off / 2.0 + np.log(np.log(RATIO) / SIZE / np.sqrt(2.0 * np.pi))
+    return found, np.array([one.evidence for one in found]) + density
+
+
+def _held(start: Solid, axis: int, level: Level) -> _Found:
+    """Return the fit with a length that is held."""
+    prior = _prior(start.kind)
     prior[6 + axis, 6 + axis] = HELD
-    found = []
-    for length in lengths:
-        one = _run(_resized(solid, axis, float(length)), patch.coarse, PROFILE_STEPS, prior)
-        if not np.isfinite(one.fit.cost):
-            continue
-        off = (np.log(length) - middle) / SIZE
-        density = -off * off / 2.0 - np.log(SIZE * np.sqrt(2.0 * np.pi)) + np.log(step)
-        estimate = _estimate(one, factor, seen)
-        spread = estimate.covariance.copy()
-        spread[6 + axis, 6 + axis] += step * step / 12.0  # of lengths between two
-        lever = np.zeros(9)
-        lever[3:6] = 0.5 * solid.pose[:3, axis] * np.sign(solid.pose[:3, axis] @ solid.pose[:3, 3]) * length
-        lever[6 + axis] = 1.0
-        spread = estimate.covariance + step * step / 12.0 * np.outer(lever, lever)
-        found.append((one.evidence + float(density), Estimate(estimate.solid, spread)))
-    return found
+    return _run(start, level, PROFILE_STEPS, prior)
 
 
-def _with_cube(
-    best: _Found, parts: list[tuple[float, Estimate]], factor: float, patch: Patch, seen: CorrectedFrame,
-    weights: Weights,
-) -> list[tuple[float, Estimate]]:  # fmt: skip
-    """Return hypotheses with that of a cube."""
-    return parts
+def _between(one: Estimate, axis: int) -> Estimate:
+    """Return an estimate of a length that is held, with the spread of the lengths up to the next one."""
+    lever = np.zeros(9)
+    pose, step = one.solid.pose, np.log(RATIO)
+    lever[3:6] = np.sign(pose[:3, axis] @ pose[:3, 3]) * one.solid.size[axis] / 2.0 * pose[:3, axis]
+    lever[6 + axis] = 1.0
+    return Estimate(one.solid, one.covariance + step * step / 12.0 * np.outer(lever, lever))
+
+
+def _cube(best: _Found, patch: Patch) -> _Found:
+    """Return the fit of a cube, whose front is that of a box."""
+    solid = best.solid
+    area = np.abs(solid.pose[:3, :3].T @ solid.pose[:3, 3]) / solid.size
+    front = int(np.argmax(area))
+    side = float(np.sqrt(np.delete(solid.size, front).prod()))
+    return _run(
+        Solid("box", np.full(3, side), _resized(solid, front, side).pose), patch.fine, FINE_STEPS, ties=(0, 0, 0)
+    )
 
 
 def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _Found | None:
@@ -513,19 +536,16 @@ def _squared(points: Array, normal: Array) -> Array:
 
 
 def _boxes(frame: Array, patch: Patch) -> list[Solid]:
-    """Return boxes of the points' extents, and deeper ones along the line of sight, their fronts the same."""
+    """Return a box of the points' extents, as deep as it is wide where they are less deep, its front where it is."""
     along = patch.extent @ frame
     low, high = np.percentile(along, [1.0, 99.0], axis=0)
-    size = np.maximum(high - low, 0.01)
-    solid = _solid("box", size, frame, (high + low) / 2.0)
-    return _deeper(solid, 0)
+    return [_deep(_solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0), 0)]
 
 
-def _deeper(solid: Solid, axis: int) -> list[Solid]:
-    """Return a solid and deeper ones along an axis."""
+def _deep(solid: Solid, axis: int) -> Solid:
+    """Return a solid at least as deep along an axis as it is wide across it."""
     others = float(np.delete(solid.size, axis).mean())
-    lengths = [share * others for share in DEPTHS if share * others > 1.15 * solid.size[axis]]
-    return [solid, *(_resized(solid, axis, length) for length in lengths)]
+    return _resized(solid, axis, max(others, float(solid.size[axis])))
 
 
 def _cylinders(axis: Array, patch: Patch) -> list[Solid]:
@@ -546,7 +566,7 @@ def _cylinders(axis: Array, patch: Patch) -> list[Solid]:
     if seen_end < 0.8 and size[2] > 0.4 * radius:
         middle[1] = low[1] + radius if away[1] > 0.0 else high[1] - radius
     solid = _solid("cylinder", np.array([2.0 * radius, 2.0 * radius, size[2]]), frame, middle)
-    return _deeper(solid, 2) if seen_end > 0.6 else [solid]
+    return [_deep(solid, 2) if seen_end > 0.6 else solid]
 
 
 def _solid(kind: Kind, size: Array, frame: Array, middle: Array) -> Solid:
