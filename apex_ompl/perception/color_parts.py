@@ -62,7 +62,7 @@ class ColorPart(NamedTuple):
         own: Its pixels, shape (h, w).
         filled: Depths, those of the nearest pixel that has one where it has none of its own, shape (h, w) [m].
         depth: Its median depth [m].
-        count: Number of pixels with depths that are sure.
+        size: Number of pixels with depths that are sure.
     """
 
     left: int
@@ -70,7 +70,7 @@ class ColorPart(NamedTuple):
     own: Mask
     filled: Array
     depth: float
-    count: int
+    size: int
 
 
 def color_parts(
@@ -168,15 +168,15 @@ def _together(first: ColorPart, second: ColorPart) -> ColorPart:
     right = max(one.left + one.own.shape[1] for one in (first, second))
     bottom = max(one.top + one.own.shape[0] for one in (first, second))
     own, filled = np.zeros((bottom - top, right - left), bool), np.zeros((bottom - top, right - left))
-    count = first.count + second.count
+    size = first.size + second.size
     for one in (first, second):
         rows = slice(one.top - top, one.top - top + one.own.shape[0])
         columns = slice(one.left - left, one.left - left + one.own.shape[1])
         filled[rows, columns] = np.where(own[rows, columns] & ~one.own, filled[rows, columns], one.filled)
         own[rows, columns] |= one.own
-    depth = (first.depth * first.count + second.depth * second.count) / count
+    depth = (first.depth * first.size + second.depth * second.size) / size
     filled = np.where(filled > 0.0, filled, depth)
-    return ColorPart(left, top, own, filled, depth, count)
+    return ColorPart(left, top, own, filled, depth, size)
 
 
 def _occluded_between(first: ColorPart, second: ColorPart, depth: Array) -> bool:

@@ -38,6 +38,7 @@ NORMALS = 150  # that are compared at most
 SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
 SQUARE = 0.5  # cosine between normals of different sides
 THICK = 0.012  # distance from a plane of its points [m]
+THIN, THICK_SHARE = 0.35, 0.8  # shares of the width of what may be the depth of a box, and of what surely is
 PAIRS = 60  # of normals whose common perpendicular may be an axis
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 RATIO, UNLIKELY, MOST_LENGTHS = 1.25, 14.0, 8  # of lengths of the mixture; cost above the least where they end; number
@@ -536,10 +537,12 @@ def _squared(points: Array, normal: Array) -> Array:
 
 
 def _boxes(frame: Array, patch: Patch) -> list[Solid]:
-    """Return a box of the points' extents, as deep as it is wide where they are less deep, its front where it is."""
+    """Return a box of the points' extents and, where it is flat, one that is as deep as it is wide."""
     along = patch.extent @ frame
     low, high = np.percentile(along, [1.0, 99.0], axis=0)
-    return [_deep(_solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0), 0)]
+    solid = _solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0)
+    share = solid.size[0] / solid.size[1:].mean()
+    return ([solid] if share > THIN else []) + ([_deep(solid, 0)] if share < THICK_SHARE else [])
 
 
 def _deep(solid: Solid, axis: int) -> Solid:

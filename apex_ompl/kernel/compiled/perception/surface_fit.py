@@ -407,7 +407,8 @@ def _add_uncovered(
         gu, gv = -right / apart, -down / apart
         _contour_row(row, camera, ties, symmetry, rotation, position, x, y, z, gu, gv)
         _add(matrix, vector, cross, row, camera, share * weight / variance, r)
-    return share * loss * largest * largest / variance
+    lost: float = share * loss * largest * largest / variance
+    return lost
 
 
 @inlined
@@ -430,7 +431,7 @@ def _add_contour(
 ) -> float:  # fmt: skip
     """Add the residuals of the drawing's contour from what may be covered, and return their cost.
 
-    Where the outline is known, parts of the contour that agree with it count, too.
+    Where the outline is known, parts of the contour that agree with it count, too, and so does the border of the window.
     """
     _, floor, edge, _, share, _, _, reach = settings
     height, width = index.shape
@@ -439,7 +440,8 @@ def _add_contour(
         for j in range(1, width - 1):
             if index[i, j] < 0 or (beyond[i, j] == 0.0 and not known):
                 continue
-            if index[i - 1, j] >= 0 and index[i + 1, j] >= 0 and index[i, j - 1] >= 0 and index[i, j + 1] >= 0:
+            inner = index[i - 1, j] >= 0 and index[i + 1, j] >= 0 and index[i, j - 1] >= 0 and index[i, j + 1] >= 0
+            if inner and not (known and (i == 1 or j == 1 or i == height - 2 or j == width - 2)):
                 continue
             gu, gv = (beyond[i, j + 1] - beyond[i, j - 1]) / 2.0, (beyond[i + 1, j] - beyond[i - 1, j]) / 2.0
             if not (math.isfinite(gu) and math.isfinite(gv)):
