@@ -135,17 +135,23 @@ def _closest(placed: Floats, a: int, b: int, c: int, x: float, y: float, z: floa
 
 
 @inlined
-def _add(matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, weight: float, r: float) -> None:
-    """Add a residual with its derivatives by unknowns and by the camera to the normal equations."""
-    n = len(vector)
-    for k in range(n):
+def _add(
+    matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, weight: float, r: float, final: bool
+) -> None:  # fmt: skip
+    """Add a residual with its derivatives by unknowns to the normal equations, whose matrix gets its lower half.
+
+    Those by the camera are added at the ``final`` step only.
+    """
+    for k in range(len(vector)):
         if row[k] == 0.0:
             continue
-        vector[k] -= weight * r * row[k]
-        for m in range(n):
-            matrix[k, m] += weight * row[k] * row[m]
-        for m in range(CAMERA):
-            cross[k, m] += weight * row[k] * camera[m]
+        scaled = weight * row[k]
+        vector[k] -= scaled * r
+        for m in range(k + 1):
+            matrix[k, m] += scaled * row[m]
+        if final:
+            for m in range(CAMERA):
+                cross[k, m] += scaled * camera[m]
 
 
 @inlined
@@ -279,14 +285,17 @@ def fit_surface(
         cutoff = max(last, first * 0.7**step) if step < steps else last
         cost = _add_points(
             points, outline, lens, faces, ties, symmetry, rotation, position, settings, cutoff, placed, depth, index,
-            matrix, vector, cross, row, camera,
+            matrix, vector, cross, row, camera, step == steps,
         )  # fmt: skip
         cost += _add_contour(
             beyond, outline < len(points), lens, ties, symmetry, rotation, position, settings, depth, index, matrix,
-            vector, cross, row, camera,
+            vector, cross, row, camera, step == steps,
         )  # fmt: skip
         cost += _add_prior(matrix, vector, prior, rotation, position, scale, ties, prior_rotation, prior_position, row)
         if step == steps:
+            for k in range(len(vector)):
+                for m in range(k):
+                    matrix[m, k] = matrix[k, m]
             break
         _copy(matrix, factor)
         if not _solve(factor, vector):
@@ -332,7 +341,7 @@ def _add_points(
     points: Floats, outline: int, lens: Floats, faces: Integers, ties: Integers, symmetry: int, rotation: Floats,
     position: Floats, settings: tuple[float, float, float, float, float, float, float, float], cutoff: float,
     placed: Floats, depth: Floats, index: Integers, matrix: Floats, vector: Floats, cross: Floats, row: Floats,
-    camera: Floats,
+    camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residuals of points from the drawn surface to the normal equations, and return their cost."""
     noise, floor, edge, point_share, contour_share, _, last, reach = settings
@@ -354,7 +363,7 @@ def _add_points(
                 if p >= outline:
                     cost += _add_uncovered(
                         i, j, line - i, column - j, apart, lens, ties, symmetry, rotation, position, settings, largest,
-                        depth, matrix, vector, cross, row, camera,
+                        depth, matrix, vector, cross, row, camera, final,
                     )  # fmt: skip
                     continue
         if k < 0:
@@ -382,7 +391,7 @@ def _add_points(
         _surface_row(row, rotation, position, ties, symmetry, x - r * nx, y - r * ny, z - r * nz, -nx, -ny, -nz)
         camera[0], camera[1], camera[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
         camera[3], camera[4], camera[5], camera[6] = nx, ny, nz, nx * x + ny * y + nz * z
-        _add(matrix, vector, cross, row, camera, share * weight / variance, r)
+        _add(matrix, vector, cross, row, camera, share * weight / variance, r, final)
     return cost
 
 
@@ -390,7 +399,7 @@ def _add_points(
 def _add_uncovered(
     i: int, j: int, down: int, right: int, apart: float, lens: Floats, ties: Integers, symmetry: int, rotation: Floats,
     position: Floats, settings: tuple[float, float, float, float, float, float, float, float], largest: float,
-    depth: Floats, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+    depth: Floats, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residual of a pixel of the object that the drawing does not cover, and return its cost.
 
@@ -406,7 +415,7 @@ def _add_uncovered(
     if weight > 0.0:
         gu, gv = -right / apart, -down / apart
         _contour_row(row, camera, ties, symmetry, rotation, position, x, y, z, gu, gv)
-        _add(matrix, vector, cross, row, camera, share * weight / variance, r)
+        _add(matrix, vector, cross, row, camera, share * weight / variance, r, final)
     lost: float = share * loss * largest * largest / variance
     return lost
 
@@ -427,7 +436,7 @@ def _contour_row(
 def _add_contour(
     beyond: Floats, known: bool, lens: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats,
     settings: tuple[float, float, float, float, float, float, float, float], depth: Floats, index: Integers,
-    matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+    matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residuals of the drawing's contour from what may be covered, and return their cost.
 
@@ -461,7 +470,7 @@ def _add_contour(
             if weight == 0.0:
                 continue
             _contour_row(row, camera, ties, symmetry, rotation, position, x, y, z, gu, gv)
-            _add(matrix, vector, cross, row, camera, share * weight / variance, r)
+            _add(matrix, vector, cross, row, camera, share * weight / variance, r, final)
     return cost
 
 
