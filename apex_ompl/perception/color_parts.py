@@ -74,7 +74,7 @@ class ColorPart(NamedTuple):
 
 
 def color_parts(
-    image: NDArray[np.uint8], depth: Array, color: Color, noise: float, least: float, largest: float
+    image: NDArray[np.uint8], depth: Array, color: Color, *, noise: float, least: float, largest: float
 ) -> list[ColorPart]:  # fmt: skip
     """Return the parts of a color.
 
@@ -87,11 +87,14 @@ def color_parts(
         largest: Largest length of an obstacle, whose parts an occluder may divide [m].
     """
     cv = opencv()
-    coarse = color.pixels(image[::2, ::2]).astype(np.uint8)
+    half = image.shape[1] // 2, image.shape[0] // 2
+    coarse = color.pixels(cv.resize(image[: 2 * half[1], : 2 * half[0]], half, interpolation=cv.INTER_NEAREST)).astype(
+        np.uint8
+    )
     count, labels, stats, _ = cv.connectedComponentsWithStats(coarse, connectivity=8)
     parts = []
     for k in range(1, count):
-        if 4 * stats[k, cv.CC_STAT_AREA] < least / 2:
+        if 4 * stats[k, cv.CC_STAT_AREA] < least:
             continue
         left, top = (2 * max(0, int(stats[k, axis]) - PAD // 2) for axis in (cv.CC_STAT_LEFT, cv.CC_STAT_TOP))
         right = 2 * (int(stats[k, cv.CC_STAT_LEFT] + stats[k, cv.CC_STAT_WIDTH]) + PAD // 2)
@@ -104,12 +107,12 @@ def color_parts(
         near = near.repeat(2, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]] > 0
         own = np.zeros(shape, bool)
         own[: near.shape[0], : near.shape[1]] = color.pixels(image[crop])[: near.shape[0], : near.shape[1]] & near
-        parts += _connected(own, depth[crop], noise, least, left, top)
+        parts += _connected(own, depth[crop], (left, top), noise=noise, least=least)
     return _merged(parts, depth, largest)
 
 
-def _connected(own: Mask, depth: Array, noise: float, least: float, left: int, top: int) -> list[ColorPart]:
-    """Return the parts of the color in a window whose depths are connected."""
+def _connected(own: Mask, depth: Array, corner: tuple[int, int], *, noise: float, least: float) -> list[ColorPart]:
+    """Return the parts of the color in a window from a corner on (left, top) whose depths are connected."""
     cv = opencv()
     jump = _steps(depth, np.maximum(APART, 9.0 * noise * depth * depth))
     core = cv.morphologyEx((own & (depth > 0.0) & ~jump).astype(np.uint8), cv.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -129,7 +132,7 @@ def _connected(own: Mask, depth: Array, noise: float, least: float, left: int, t
     mine, owners = own & (away <= NEIGHBOR) & ~other, owner[nearest]
     return [
         ColorPart(
-            left, top, mine & (owners == k), filled, float(np.median(depth[labels == k])),
+            *corner, mine & (owners == k), filled, float(np.median(depth[labels == k])),
             int(stats[k, cv.CC_STAT_AREA]),
         )
         for k in np.flatnonzero(chosen)

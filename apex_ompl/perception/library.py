@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from apex_ompl.util.extras import import_extra
 
 
+@cache
 def opencv() -> Any:
     """Return the module ``cv2``.
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.perception.color_parts import Color, Mask, color_parts
+from apex_ompl.perception.color_parts import Color, ColorPart, Mask, color_parts
 from apex_ompl.perception.library import opencv
 from apex_ompl.perception.registration import CorrectedFrame
 from apex_ompl.perception.rendering import resampled, undistorted
@@ -191,7 +191,7 @@ class ObstacleFinder:
         s = self.settings
         image = resampled(color, undistorted(seen.camera))
         found = []
-        for part in color_parts(image, seen.depth, self._color, seen.noise, s.least_points, s.largest):
+        for part in self._parts(image, seen):
             patch = patch_of(part, seen, self._weights, s.least_points)
             if patch is None or not self._wanted(patch, seen, others):
                 continue
@@ -200,6 +200,12 @@ class ObstacleFinder:
             if answer is not None and self._sized(answer):
                 found.append(answer)
         return tuple(sorted(found, key=lambda one: -one.points))
+
+    def _parts(self, image: NDArray[np.uint8], seen: CorrectedFrame) -> list[ColorPart]:
+        s = self.settings
+        return color_parts(
+            image, seen.depth, self._color, noise=seen.noise, least=s.least_points, largest=s.largest
+        )  # fmt: skip
 
     def colored(self, image: NDArray[np.uint8]) -> Mask:
         """Return the pixels of an image, shape (height, width, 3), that have the color."""

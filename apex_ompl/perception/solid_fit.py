@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import permutations
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -32,14 +33,14 @@ Kind = Literal["box", "cylinder"]
 COARSE, FINE = 45, 90  # width or height of windows [pixels]
 COARSE_POINTS = 120
 COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at most
-COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 6, 6, 3
+COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 5, 5, 3
 RIVALS, RIVAL = 3, 1.3  # fits that are refined at most, and their largest cost over the least
 NORMALS = 150  # that are compared at most
 SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
 SQUARE = 0.5  # cosine between normals of different sides
 THICK = 0.012  # distance from a plane of its points [m]
 THIN, THICK_SHARE = 0.35, 0.8  # shares of the width of what may be the depth of a box, and of what surely is
-PAIRS = 60  # of normals whose common perpendicular may be an axis
+PAIRS = np.random.default_rng(0).random((60, 2))  # of normals whose common perpendicular may be an axis
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 RATIO, UNLIKELY, MOST_LENGTHS = 1.25, 14.0, 8  # of lengths of the mixture; cost above the least where they end; number
 VAGUE = 0.06  # standard deviation of the logarithm of a length above which it has a mixture of its own
@@ -47,7 +48,10 @@ KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
 MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
+NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
+NOT_SQUARE = 0.06  # logarithm of the ratio of sides from which on a box is no cube, beside the errors
 SLICES = 32
+ORDERS = tuple(permutations(range(3)))  # of known lengths along the axes of a box
 
 
 @dataclass(frozen=True)
@@ -250,7 +254,7 @@ def _normals(grid: Array, measured: Mask) -> tuple[Array, Array]:
     rows, columns = rows[::step] + r, columns[::step] + r
     down = smooth[rows + r, columns] - smooth[rows - r, columns]
     across = smooth[rows, columns + r] - smooth[rows, columns - r]
-    normals = np.cross(down, across)
+    normals = _crosses(down, across)
     normals /= np.maximum(np.sqrt((normals * normals).sum(axis=1, keepdims=True)), 1e-12)
     return smooth[rows, columns], np.asarray(normals)
 
@@ -278,7 +282,7 @@ def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence
         if len(held) > 1:
             held_parts = [_between(_estimate(one, misfit, seen), axis) for one in held]
             parts = list(zip(evidence.tolist(), held_parts, strict=True))
-    if best.start.kind == "box" and weights.cubes > 0.0:
+    if best.start.kind == "box" and weights.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
         parts = [(one + float(np.log(1.0 - weights.cubes)), solid) for one, solid in parts]
         parts.append((cube.evidence + float(np.log(weights.cubes)), _estimate(cube, misfit, seen)))
@@ -310,8 +314,8 @@ def _run(
         s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach, steps
     )  # fmt: skip
     fit = fit_surface(
-        level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry, start.pose,
-        start.pose, before, settings, level.measured,
+        level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry,
+        start.pose, start.pose, before, settings, level.measured,
     )  # fmt: skip
     return _Found(start, fit, before, [*range(6), *(6 + tied)])
 
@@ -410,11 +414,24 @@ def _between(one: Estimate, axis: int) -> Estimate:
     return Estimate(one.solid, one.covariance + step * step / 12.0 * np.outer(lever, lever))
 
 
+def _front(solid: Solid) -> int:
+    """Return the axis of the side that is seen most."""
+    return int(np.argmax(np.abs(solid.pose[:3, :3].T @ solid.pose[:3, 3]) / solid.size))
+
+
+def _square(one: Estimate) -> bool:
+    """Return whether the side of a box that is seen most may be that of a cube."""
+    first, second = (k for k in range(3) if k != _front(one.solid))
+    size, variance = one.solid.size, np.diag(one.covariance)[6:]
+    return bool(
+        abs(np.log(size[first] / size[second])) < NOT_SQUARE + 4.0 * np.sqrt(variance[first] + variance[second])
+    )
+
+
 def _cube(best: _Found, patch: Patch) -> _Found:
     """Return the fit of a cube, whose front is that of a box."""
     solid = best.solid
-    area = np.abs(solid.pose[:3, :3].T @ solid.pose[:3, 3]) / solid.size
-    front = int(np.argmax(area))
+    front = _front(solid)
     side = float(np.sqrt(np.delete(solid.size, front).prod()))
     return _run(
         Solid("box", np.full(3, side), _resized(solid, front, side).pose), patch.fine, FINE_STEPS, ties=(0, 0, 0)
@@ -422,14 +439,37 @@ def _cube(best: _Found, patch: Patch) -> _Found:
 
 
 def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _Found | None:
-    """Return the best fit of a known size, or None where none fits."""
-    return None
+    """Return the best fit of a known size, or None where none fits as well as a size of its own."""
+    found: list[tuple[float, int, _Found, Array]] = []
+    for one in known:
+        solid = best.solid if one.kind == best.start.kind else None
+        if solid is None:
+            continue
+        orders = ORDERS if one.kind == "box" else ORDERS[:1]
+        for size in dict.fromkeys(tuple(one.size[list(order)].tolist()) for order in orders):
+            start = solid
+            for axis in range(3):
+                start = _resized(start, axis, float(size[axis]))
+            prior = _prior(one.kind)
+            for axis in range(3) if one.kind == "box" else (0, 2):
+                prior[6 + axis, 6 + axis] = (size[axis] / one.spread) ** 2
+            coarse = _run(start, patch.coarse, PROFILE_STEPS, prior)
+            found.append((coarse.fit.cost, len(found), coarse, prior))
+    refined = [
+        _run(Solid(one.start.kind, one.start.size, one.solid.pose), patch.fine, FINE_STEPS, prior)
+        for cost, _, one, prior in sorted(found)[:RIVALS]
+        if np.isfinite(cost)
+    ]
+    likely = [one for one in refined if one.fit.cost < best.fit.cost + UNLIKELY]
+    return min(likely, key=lambda one: one.fit.cost) if likely else None
 
 
 def _mixture(parts: list[tuple[float, Estimate]]) -> Estimate | None:
     """Return the mean and the covariance of hypotheses; turns are those of the most likely one."""
     if not parts:
         return None
+    evidence = np.array([one for one, _ in parts])
+    parts = [one for one, value in zip(parts, evidence, strict=True) if value > evidence.max() - NEGLIGIBLE]
     evidence = np.array([one for one, _ in parts])
     weight = np.exp(evidence - evidence.max())
     weight /= weight.sum()
@@ -475,9 +515,8 @@ def _round_axis(normals: Array) -> Array | None:
     """Return the axis to which most normals are perpendicular or, those of a cap, parallel (RANSAC); None for few."""
     if len(normals) < 8:
         return None
-    rng = np.random.default_rng(0)
-    pairs = rng.integers(len(normals), size=(PAIRS, 2))
-    axes = np.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
+    pairs = (PAIRS * len(normals)).astype(np.int64)
+    axes = _crosses(normals[pairs[:, 0]], normals[pairs[:, 1]])
     lengths = np.sqrt((axes * axes).sum(axis=1))
     if not (lengths > 0.3).any():
         return None
@@ -512,7 +551,7 @@ def _frame(first: Array, second: Array) -> Array:
     """Return a rotation whose x is the first vector and whose y is in the plane of both."""
     y = second - (second @ first) * first
     y /= np.sqrt(y @ y)
-    return np.stack([first, y, np.cross(first, y)], axis=1)
+    return np.stack([first, y, _cross(first, y)], axis=1)
 
 
 def _turned(frame: Array, angle: float) -> Array:
@@ -530,7 +569,7 @@ def _longest(points: Array, normal: Array) -> Array:
 def _squared(points: Array, normal: Array) -> Array:
     """Return the rotation whose x is a normal, along the sides of the smallest rectangle around points across it."""
     y = _longest(points, normal)
-    z = np.cross(normal, y)
+    z = _cross(normal, y)
     flat = np.stack([points @ y, points @ z], axis=-1).astype(np.float32)
     angle = np.radians(opencv().minAreaRect(flat)[2])
     return _frame(normal, np.cos(angle) * y + np.sin(angle) * z)
@@ -539,10 +578,29 @@ def _squared(points: Array, normal: Array) -> Array:
 def _boxes(frame: Array, patch: Patch) -> list[Solid]:
     """Return a box of the points' extents and, where it is flat, one that is as deep as it is wide."""
     along = patch.extent @ frame
-    low, high = np.percentile(along, [1.0, 99.0], axis=0)
+    low, high = _extent(along)
     solid = _solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0)
     share = solid.size[0] / solid.size[1:].mean()
     return ([solid] if share > THIN else []) + ([_deep(solid, 0)] if share < THICK_SHARE else [])
+
+
+def _extent(along: Array) -> tuple[Array, Array]:
+    """Return the first and the last percentile of each column."""
+    order = np.sort(along, axis=0)
+    skipped = len(order) // 100
+    return order[skipped], order[-1 - skipped]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the vector product of two vectors, shape (3,); NumPy's takes ten times as long."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _crosses(a: Array, b: Array) -> Array:
+    """Return the vector products of rows, shape (N, 3)."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def _deep(solid: Solid, axis: int) -> Solid:
@@ -555,14 +613,14 @@ def _cylinders(axis: Array, patch: Patch) -> list[Solid]:
     """Return cylinders along an axis whose outline and front are those of the points."""
     points = patch.extent
     sight = points.mean(axis=0)
-    across = np.cross(axis, sight)
+    across = _cross(axis, sight)
     seen_end = float(np.abs(axis @ sight) / np.sqrt(sight @ sight))  # cosine
     if across @ across < 0.0004 * (sight @ sight):  # along the line of sight
         across = _longest(points, axis)
     across /= np.sqrt(across @ across)
-    frame = np.stack([across, np.cross(axis, across), axis], axis=1)
+    frame = np.stack([across, _cross(axis, across), axis], axis=1)
     along = points @ frame
-    low, high = np.percentile(along, [1.0, 99.0], axis=0)
+    low, high = _extent(along)
     size, middle = np.maximum(high - low, 0.01), (high + low) / 2.0
     away = frame.T @ sight
     radius = float(size[0]) / 2.0

@@ -440,7 +440,7 @@ def _add_contour(
 ) -> float:  # fmt: skip
     """Add the residuals of the drawing's contour from what may be covered, and return their cost.
 
-    Where the outline is known, parts of the contour that agree with it count, too, and so does the border of the window.
+    Where the outline is known, parts of the contour that agree with it and the border of the window count, too.
     """
     _, floor, edge, _, share, _, _, reach = settings
     height, width = index.shape
