@@ -12,12 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.perception import AXIS, FitSettings, SurfaceFit, Window, fit_surface
 from apex_ompl.perception.color_parts import APART, BEFORE, PAD, ColorPart
 from apex_ompl.perception.library import opencv
@@ -26,6 +27,7 @@ from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.surfaces import Surface, body_surface
 from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array, Indices
+from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 Mask = NDArray[np.bool_]
 Kind = Literal["box", "cylinder"]
@@ -82,6 +84,21 @@ class KnownSize:
     kind: Kind
     size: Array
     spread: float = 0.001
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            ParameterError: The kind is another, or lengths are not positive.
+        """
+        if self.kind not in get_args(Kind):
+            raise ParameterError("kind", self.kind, f"one of {', '.join(get_args(Kind))}")
+        size = finite_array(self.size, "size")
+        check_array(size, (3,), "size")
+        if not (size > 0.0).all():
+            raise ParameterError("size", size.tolist(), "three positive lengths")
+        object.__setattr__(self, "size", size)
+        check_positive(self.spread, "spread")
 
 
 class Solid(NamedTuple):
@@ -286,7 +303,7 @@ def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence
         cube = _cube(best, patch)
         parts = [(one + float(np.log(1.0 - weights.cubes)), solid) for one, solid in parts]
         parts.append((cube.evidence + float(np.log(weights.cubes)), _estimate(cube, misfit, seen)))
-    return _mixture(parts)
+    return mixture(parts)
 
 
 def _searched(patch: Patch) -> _Found | None:
@@ -464,7 +481,7 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
     return min(likely, key=lambda one: one.fit.cost) if likely else None
 
 
-def _mixture(parts: list[tuple[float, Estimate]]) -> Estimate | None:
+def mixture(parts: list[tuple[float, Estimate]]) -> Estimate | None:
     """Return the mean and the covariance of hypotheses; turns are those of the most likely one."""
     if not parts:
         return None

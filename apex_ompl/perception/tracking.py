@@ -27,7 +27,7 @@ from apex_ompl.perception.library import assignment
 from apex_ompl.perception.obstacles import SeenObstacle, solid_obstacle
 from apex_ompl.perception.registration import CorrectedFrame
 from apex_ompl.perception.rendering import lens_of
-from apex_ompl.perception.solid_fit import Kind
+from apex_ompl.perception.solid_fit import Kind, KnownSize
 from apex_ompl.perception.surfaces import inverse
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array, Indices
@@ -128,6 +128,10 @@ class TrackedObstacle:
     def place_covariance(self) -> Array:
         """Covariance of the center in the axes of the world, shape (3, 3) [m^2]."""
         return self.covariance[PLACE, PLACE]
+
+    def known_size(self) -> KnownSize:
+        """Return its size for :meth:`apex_ompl.perception.ObstacleFinder.find` in later frames."""
+        return KnownSize(self.kind, self.size, float(np.sqrt(np.diag(self.covariance)[SIZE].max())))
 
     def obstacle(self, deviations: float = 0.0) -> Obstacle:
         """Return the obstacle of a scene, larger by some standard deviations of each of its ends.

@@ -147,7 +147,7 @@ def row(label: str, chosen: Sequence[Sample]) -> list[Any]:
 def main() -> None:
     """Measure, and write the results."""
     given = record.parser(__doc__ or "", 100, "scenes of a kind and a renderer").parse_args()
-    made, renderers = robot(), (ZBuffer(), Mujoco())
+    made, renderers = robot(), list[Renderer]((ZBuffer(), Mujoco()))
     both = [samples(made, renderer, seed, given.n) for renderer, seed in zip(renderers, SEEDS, strict=True)]
     found, sized = ([one for some in both for one in some[k]] for k in range(2))
     rows = [row(kind, [one for one in found if one.kind == kind]) for kind in KINDS]
