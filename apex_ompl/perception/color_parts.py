@@ -61,7 +61,7 @@ class ColorPart(NamedTuple):
         top: First row [pixels].
         own: Its pixels, shape (h, w).
         filled: Depths, those of the nearest pixel that has one where it has none of its own, shape (h, w) [m].
-        depth: Its median depth [m].
+        depth: Its mean depth [m].
         size: Number of pixels with depths that are sure.
     """
 
@@ -132,7 +132,7 @@ def _connected(own: Mask, depth: Array, corner: tuple[int, int], *, noise: float
     mine, owners = own & (away <= NEIGHBOR) & ~other, owner[nearest]
     return [
         ColorPart(
-            *corner, mine & (owners == k), filled, float(np.median(depth[labels == k])),
+            *corner, mine & (owners == k), filled, float(depth[labels == k].mean()),
             int(stats[k, cv.CC_STAT_AREA]),
         )
         for k in np.flatnonzero(chosen)

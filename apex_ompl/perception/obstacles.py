@@ -213,7 +213,7 @@ class ObstacleFinder:
 
     def _wanted(self, patch: Patch, seen: CorrectedFrame, others: Sequence[tuple[Array, float]]) -> bool:
         pose, s = seen.registration.pose, self.settings
-        center = pose[:3, :3] @ np.median(patch.coarse.points[: patch.coarse.measured], axis=0) + pose[:3, 3]
+        center = pose[:3, :3] @ patch.coarse.points[: patch.coarse.measured].mean(axis=0) + pose[:3, 3]
         if not ((center > s.low) & (center < s.high)).all():
             return False
         return all(np.linalg.norm(center - place) > radius for place, radius in others)

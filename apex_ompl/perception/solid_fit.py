@@ -44,7 +44,10 @@ THICK = 0.012  # distance from a plane of its points [m]
 THIN, THICK_SHARE = 0.35, 0.8  # shares of the width of what may be the depth of a box, and of what surely is
 PAIRS = np.random.default_rng(0).random((60, 2))  # of normals whose common perpendicular may be an axis
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
-RATIO, UNLIKELY, MOST_LENGTHS = 1.25, 14.0, 8  # of lengths of the mixture; cost above the least where they end; number
+SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
+STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
+UNLIKELY, MOST_LENGTHS = 14.0, 8  # cost above the least where lengths of the mixture end, and their number
+SHARP = 0.09  # standard deviation of the logarithm of a length below which it has no mixture
 VAGUE = 0.06  # standard deviation of the logarithm of a length above which it has a mixture of its own
 KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
@@ -295,10 +298,13 @@ def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence
     parts = [(best.evidence, _estimate(best, misfit, seen))]
     axis = _vague_axis(parts[0][1])
     if axis is not None:
-        held, evidence = _profile(best, axis, patch, weights)
-        if len(held) > 1:
-            held_parts = [_between(_estimate(one, misfit, seen), axis) for one in held]
-            parts = list(zip(evidence.tolist(), held_parts, strict=True))
+        held, evidence, deviation = _profile(best, axis, patch, weights)
+        if deviation > SHARP and len(held) > 1:
+            likely = [k for k, one in enumerate(evidence) if one > max(evidence) - NEGLIGIBLE]
+            parts = [(evidence[k], _spread(_estimate(held[k], misfit, seen), axis, STEP**2 / 12.0)) for k in likely]
+        else:
+            more = misfit * deviation**2 - parts[0][1].covariance[6 + axis, 6 + axis]
+            parts = [(parts[0][0], _spread(parts[0][1], axis, max(0.0, more)))]
     if best.start.kind == "box" and weights.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
         parts = [(one + float(np.log(1.0 - weights.cubes)), solid) for one, solid in parts]
@@ -312,10 +318,22 @@ def _searched(patch: Patch) -> _Found | None:
     found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
     if not found:
         return None
-    rivals = [found[0], *(one for one in found[1:RIVALS] if one.fit.cost < RIVAL * found[0].fit.cost)]
+    rivals: list[_Found] = []
+    for one in found:
+        if one.fit.cost > RIVAL * found[0].fit.cost or len(rivals) == RIVALS:
+            break
+        if not any(_alike(one.solid, other.solid) for other in rivals):
+            rivals.append(one)
     refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals]
     refined = [one for one in refined if np.isfinite(one.fit.cost)]
     return min(refined, key=lambda one: one.fit.cost) if refined else None
+
+
+def _alike(first: Solid, second: Solid) -> bool:
+    """Return whether two solids are nearly the same."""
+    apart = np.abs(first.pose[:3, 3] - second.pose[:3, 3]).max()
+    larger = np.abs(np.log(np.sort(first.size) / np.sort(second.size))).max()
+    return first.kind == second.kind and bool(apart < SAME_PLACE and larger < SAME_SIZE)
 
 
 def _run(
@@ -390,29 +408,33 @@ def _resized(solid: Solid, axis: int, length: float) -> Solid:
     return Solid(solid.kind, size, pose)
 
 
-def _profile(best: _Found, axis: int, patch: Patch, weights: Weights) -> tuple[list[_Found], Array]:
+def _profile(best: _Found, axis: int, patch: Patch, weights: Weights) -> tuple[list[_Found], list[float], float]:
     """Return fits with lengths along an axis that are held, and the logarithms of their evidence.
 
-    Lengths grow and fall from the best one by a ratio until their costs are too large.
+    Lengths grow and fall from the best one by a ratio until their costs are too large. The third is the standard
+    deviation of the logarithm of the length, by the costs of its neighbors.
     """
     first = best.solid.size[axis]
     middle = float(np.log(np.delete(best.solid.size, axis)).mean())
-    least = best.fit.cost
-    found: list[_Found] = []
-    for ratio in (RATIO, 1.0 / RATIO):
-        solid, length = best.solid, first * (1.0 if ratio > 1.0 else ratio)
-        for _ in range(MOST_LENGTHS):
+    center = _held(best.solid, axis, patch.fine)
+    found, least, rises = [center], min(best.fit.cost, center.fit.cost), []
+    for ratio in (np.exp(STEP), np.exp(-STEP)):
+        solid, length = best.solid, first * ratio
+        for k in range(MOST_LENGTHS):
             if not 0.5 * weights.smallest < length < weights.largest:
                 break
             one = _held(_resized(solid, axis, length), axis, patch.fine)
+            if k == 0:
+                rises.append(one.fit.cost - best.fit.cost)
             if not one.fit.cost < least + UNLIKELY:
                 break
             found.append(one)
             solid, least, length = one.solid, min(least, one.fit.cost), length * ratio
-    lengths = np.array([one.solid.size[axis] for one in found])
-    off = (np.log(lengths) - middle) / SIZE
-    density = -off * off / 2.0 + np.log(np.log(RATIO) / SIZE / np.sqrt(2.0 * np.pi))
-    return found, np.array([one.evidence for one in found]) + density
+    evidence = []
+    for one in found:
+        off = (np.log(one.solid.size[axis]) - middle) / SIZE
+        evidence.append(one.evidence - off * off / 2.0 + np.log(STEP / SIZE / np.sqrt(2.0 * np.pi)))
+    return found, evidence, STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
 
 
 def _held(start: Solid, axis: int, level: Level) -> _Found:
@@ -422,13 +444,12 @@ def _held(start: Solid, axis: int, level: Level) -> _Found:
     return _run(start, level, PROFILE_STEPS, prior)
 
 
-def _between(one: Estimate, axis: int) -> Estimate:
-    """Return an estimate of a length that is held, with the spread of the lengths up to the next one."""
-    lever = np.zeros(9)
-    pose, step = one.solid.pose, np.log(RATIO)
+def _spread(one: Estimate, axis: int, variance: float) -> Estimate:
+    """Return an estimate with a larger variance of the logarithm of a length whose end at the camera stays."""
+    lever, pose = np.zeros(9), one.solid.pose
     lever[3:6] = np.sign(pose[:3, axis] @ pose[:3, 3]) * one.solid.size[axis] / 2.0 * pose[:3, axis]
     lever[6 + axis] = 1.0
-    return Estimate(one.solid, one.covariance + step * step / 12.0 * np.outer(lever, lever))
+    return Estimate(one.solid, one.covariance + variance * np.outer(lever, lever))
 
 
 def _front(solid: Solid) -> int:
@@ -519,7 +540,7 @@ def _plane(places: Array, normals: Array) -> Array | None:
     mean /= np.sqrt(mean @ mean)
     for _ in range(2):
         height = places @ mean
-        near = group & (np.abs(height - np.median(height[group])) < THICK)
+        near = group & (np.abs(height - _middle(height[group])) < THICK)
         if np.count_nonzero(near) < 6:
             break
         own = places[near] - places[near].mean(axis=0)
@@ -548,7 +569,7 @@ def _starts(patch: Patch) -> list[Solid]:
     """Return boxes and cylinders from which fits start, in the optical frame."""
     first = _plane(patch.places, patch.normals)
     if first is None:
-        first = -np.median(patch.extent, axis=0)
+        first = -patch.extent.mean(axis=0)
         first /= np.sqrt(first @ first)
     rest = np.abs(patch.normals @ first) < SQUARE
     enough = np.count_nonzero(rest) > max(3.0, 0.06 * len(patch.normals))
@@ -599,6 +620,11 @@ def _boxes(frame: Array, patch: Patch) -> list[Solid]:
     solid = _solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0)
     share = solid.size[0] / solid.size[1:].mean()
     return ([solid] if share > THIN else []) + ([_deep(solid, 0)] if share < THICK_SHARE else [])
+
+
+def _middle(values: Array) -> float:
+    """Return a median."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
 def _extent(along: Array) -> tuple[Array, Array]:
