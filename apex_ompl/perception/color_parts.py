@@ -20,7 +20,8 @@ APART = 0.04  # second difference of neighboring depths of different surfaces [m
 BEFORE = 0.03  # by which an occluder is before an obstacle [m]
 PAD = 8  # around an obstacle's pixels [pixels]
 NEIGHBOR = 40  # pixels from a measured one within which pixels of the color belong to it
-FLYING = 3  # pixels from a measured one within which a pixel may have any depth
+FLYING = 3  # pixels from a measured one within which depths may be between both sides of an edge
+SPECKS = 3  # width of the median filter of the color [pixels]
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class ColorPart(NamedTuple):
         left: First column of the window [pixels].
         top: First row [pixels].
         own: Its pixels, shape (h, w).
+        maybe: Pixels of the color beside them whose depths are others', shape (h, w).
         filled: Depths, those of the nearest pixel that has one where it has none of its own, shape (h, w) [m].
         depth: Its mean depth [m].
         size: Number of pixels with depths that are sure.
@@ -68,6 +70,7 @@ class ColorPart(NamedTuple):
     left: int
     top: int
     own: Mask
+    maybe: Mask
     filled: Array
     depth: float
     size: int
@@ -106,9 +109,17 @@ def color_parts(
         shape = depth[crop].shape
         near = near.repeat(2, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]] > 0
         own = np.zeros(shape, bool)
-        own[: near.shape[0], : near.shape[1]] = color.pixels(image[crop])[: near.shape[0], : near.shape[1]] & near
+        colored = _without_specks(color.pixels(image[crop]))
+        own[: near.shape[0], : near.shape[1]] = colored[: near.shape[0], : near.shape[1]] & near
         parts += _connected(own, depth[crop], (left, top), noise=noise, least=least)
     return _merged(parts, depth, largest)
+
+
+def _without_specks(colored: Mask) -> Mask:
+    """Return pixels of the color beside which most are of the color, with the corners between those."""
+    cv = opencv()
+    most = cv.medianBlur(colored.astype(np.uint8), SPECKS)
+    return np.asarray(colored & (cv.dilate(most, np.ones((3, 3), np.uint8)) > 0))
 
 
 def _connected(own: Mask, depth: Array, corner: tuple[int, int], *, noise: float, least: float) -> list[ColorPart]:
@@ -128,11 +139,12 @@ def _connected(own: Mask, depth: Array, corner: tuple[int, int], *, noise: float
     owner, known = np.zeros(int(nearest.max()) + 1, np.int64), np.zeros(int(nearest.max()) + 1)
     owner[nearest[kept]], known[nearest[kept]] = labels[kept], depth[kept]
     filled = np.where(kept, depth, known[nearest])
-    other = (depth > 0.0) & (np.abs(depth - filled) > APART) & (away > FLYING)
-    mine, owners = own & (away <= NEIGHBOR) & ~other, owner[nearest]
+    other = (depth > 0.0) & (np.abs(depth - filled) > APART)
+    near, owners = own & (away <= NEIGHBOR), owner[nearest]
+    mine, maybe = near & ~other, near & other & (away <= FLYING)
     return [
         ColorPart(
-            *corner, mine & (owners == k), filled, float(depth[labels == k].mean()),
+            *corner, mine & (owners == k), maybe & (owners == k), filled, float(depth[labels == k].mean()),
             int(stats[k, cv.CC_STAT_AREA]),
         )
         for k in np.flatnonzero(chosen)
@@ -170,16 +182,18 @@ def _together(first: ColorPart, second: ColorPart) -> ColorPart:
     left, top = min(first.left, second.left), min(first.top, second.top)
     right = max(one.left + one.own.shape[1] for one in (first, second))
     bottom = max(one.top + one.own.shape[0] for one in (first, second))
-    own, filled = np.zeros((bottom - top, right - left), bool), np.zeros((bottom - top, right - left))
+    own, maybe = np.zeros((2, bottom - top, right - left), bool)
+    filled = np.zeros(own.shape)
     size = first.size + second.size
     for one in (first, second):
         rows = slice(one.top - top, one.top - top + one.own.shape[0])
         columns = slice(one.left - left, one.left - left + one.own.shape[1])
         filled[rows, columns] = np.where(own[rows, columns] & ~one.own, filled[rows, columns], one.filled)
         own[rows, columns] |= one.own
+        maybe[rows, columns] |= one.maybe
     depth = (first.depth * first.size + second.depth * second.size) / size
     filled = np.where(filled > 0.0, filled, depth)
-    return ColorPart(left, top, own, filled, depth, size)
+    return ColorPart(left, top, own, maybe, filled, depth, size)
 
 
 def _occluded_between(first: ColorPart, second: ColorPart, depth: Array) -> bool:

@@ -53,6 +53,8 @@ KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
 MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
+HIDDEN = 0.03  # share of the border beside an occluder from which on an end may be hidden
+LONGER = 1.3  # ratio of lengths that tells whether one is
 NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
 NOT_SQUARE = 0.06  # logarithm of the ratio of sides from which on a box is no cube, beside the errors
 SLICES = 32
@@ -150,6 +152,7 @@ class Patch(NamedTuple):
         places: Smoothed points of its surface, shape (K, 3) [m].
         normals: Normals there, shape (K, 3).
         cut: Whether the image cuts it.
+        hidden: Whether an occluder is beside it.
         pixels: Number of pixels with depth.
     """
 
@@ -159,6 +162,7 @@ class Patch(NamedTuple):
     places: Array
     normals: Array
     cut: bool
+    hidden: bool
     pixels: int
 
 
@@ -205,7 +209,10 @@ def patch_of(part: ColorPart, seen: CorrectedFrame, weights: Weights, least: int
     sure = measured & inner  # depths at the border are often wrong
     if np.count_nonzero(sure) < least:
         sure = measured
-    covered = own | ((depth > 0.0) & (depth < guess - BEFORE))
+    occluder = (depth > 0.0) & (depth < guess - BEFORE) & ~own
+    covered = own | occluder | part.maybe[crop]
+    border = (cv.dilate(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~own
+    hidden = np.count_nonzero(border & occluder) > HIDDEN * np.count_nonzero(border)
     lens = lens_of(camera)
 
     def level(size: int, most: int, most_guessed: int) -> tuple[Level, Array]:
@@ -227,7 +234,7 @@ def patch_of(part: ColorPart, seen: CorrectedFrame, weights: Weights, least: int
     stride = coarse.window.stride
     grid = _grid(guess[::stride, ::stride], Window(corner[1], corner[0], 0, 0, stride).lens(lens))
     places, normals = _normals(grid, measured[::stride, ::stride])
-    return Patch(coarse, fine, extent, places, normals, bool(cut), pixels)
+    return Patch(coarse, fine, extent, places, normals, bool(cut), bool(hidden), pixels)
 
 
 def _fit_settings(weights: Weights, stride: int, thinning: float, seen: CorrectedFrame) -> FitSettings:
@@ -295,21 +302,31 @@ def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence
     sized = _of_known_size(best, patch, known)
     if sized is not None:
         return _estimate(sized, misfit, seen)
-    parts = [(best.evidence, _estimate(best, misfit, seen))]
-    axis = _vague_axis(parts[0][1])
-    if axis is not None:
-        held, evidence, deviation = _profile(best, axis, patch, weights)
-        if deviation > SHARP and len(held) > 1:
-            likely = [k for k, one in enumerate(evidence) if one > max(evidence) - NEGLIGIBLE]
-            parts = [(evidence[k], _spread(_estimate(held[k], misfit, seen), axis, STEP**2 / 12.0)) for k in likely]
-        else:
-            more = misfit * deviation**2 - parts[0][1].covariance[6 + axis, 6 + axis]
-            parts = [(parts[0][0], _spread(parts[0][1], axis, max(0.0, more)))]
+    parts = _hypotheses(best, misfit, patch, seen, weights)
     if best.start.kind == "box" and weights.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
         parts = [(one + float(np.log(1.0 - weights.cubes)), solid) for one, solid in parts]
         parts.append((cube.evidence + float(np.log(weights.cubes)), _estimate(cube, misfit, seen)))
     return mixture(parts)
+
+
+def _hypotheses(
+    best: _Found, misfit: float, patch: Patch, seen: CorrectedFrame, weights: Weights
+) -> list[tuple[float, Estimate]]:  # fmt: skip
+    """Return estimates of different lengths along the axis that is known least, with logarithms of their evidence."""
+    alone = _estimate(best, misfit, seen)
+    end = _hidden_end(best, patch) if patch.hidden else None
+    axis, side = end if end is not None else (_vague_axis(alone), 0.0)
+    if axis is None:
+        return [(best.evidence, alone)]
+    held, deviation = _profile(best, axis, side, patch, weights)
+    if len(held) == 1 or deviation < SHARP:
+        more = misfit * deviation**2 - alone.covariance[6 + axis, 6 + axis]
+        return [(best.evidence, _spread(alone, axis, max(0.0, more)))]
+    lengths = best.solid.size if end is not None else np.delete(best.solid.size, axis)
+    odds = _odds(held, axis, float(np.log(lengths[axis] if end is not None else lengths).mean()))
+    likely = [k for k, one in enumerate(odds) if one > max(odds) - NEGLIGIBLE]
+    return [(odds[k], _spread(_estimate(held[k], misfit, seen), axis, STEP**2 / 12.0, side)) for k in likely]
 
 
 def _searched(patch: Patch) -> _Found | None:
@@ -397,44 +414,62 @@ def _vague_axis(one: Estimate) -> int | None:
     return int(np.argmax(spread)) if spread.max() > VAGUE else None
 
 
-def _resized(solid: Solid, axis: int, length: float) -> Solid:
-    """Return a solid with another length along an axis, the end that faces the camera where it was."""
+def _resized(solid: Solid, axis: int, length: float, side: float = 0.0) -> Solid:
+    """Return a solid with another length along an axis, where the end on a side moves, by default that far away."""
     pose, size = solid.pose.copy(), solid.size.copy()
-    away = np.sign(pose[:3, axis] @ pose[:3, 3])
-    pose[:3, 3] += away * (length - size[axis]) / 2.0 * pose[:3, axis]
+    moving = side or np.sign(pose[:3, axis] @ pose[:3, 3])
+    pose[:3, 3] += moving * (length - size[axis]) / 2.0 * pose[:3, axis]
     size[axis] = length
     if solid.kind == "cylinder" and axis < 2:
         size[:2] = length
     return Solid(solid.kind, size, pose)
 
 
-def _profile(best: _Found, axis: int, patch: Patch, weights: Weights) -> tuple[list[_Found], list[float], float]:
-    """Return fits with lengths along an axis that are held, and the logarithms of their evidence.
+def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weights) -> tuple[list[_Found], float]:
+    """Return fits with lengths along an axis that are held, of which the end on a side moves.
 
-    Lengths grow and fall from the best one by a ratio until their costs are too large. The third is the standard
-    deviation of the logarithm of the length, by the costs of its neighbors.
+    Lengths grow and, where the side is 0, fall from the best one by a ratio until their costs are too large. The second
+    is the standard deviation of the logarithm of the length, by the costs of its neighbors.
     """
     first = best.solid.size[axis]
-    middle = float(np.log(np.delete(best.solid.size, axis)).mean())
     center = _held(best.solid, axis, patch.fine)
     found, least, rises = [center], min(best.fit.cost, center.fit.cost), []
-    for ratio in (np.exp(STEP), np.exp(-STEP)):
+    for ratio in (np.exp(STEP), np.exp(-STEP)) if side == 0.0 else (np.exp(STEP),):
         solid, length = best.solid, first * ratio
         for k in range(MOST_LENGTHS):
             if not 0.5 * weights.smallest < length < weights.largest:
                 break
-            one = _held(_resized(solid, axis, length), axis, patch.fine)
+            one = _held(_resized(solid, axis, length, side), axis, patch.fine)
             if k == 0:
                 rises.append(one.fit.cost - best.fit.cost)
             if not one.fit.cost < least + UNLIKELY:
                 break
             found.append(one)
             solid, least, length = one.solid, min(least, one.fit.cost), length * ratio
+    return found, STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
+
+
+def _odds(found: Sequence[_Found], axis: int, middle: float) -> list[float]:
+    """Return the logarithms of the evidence of fits with lengths that are held, with the density of these.
+
+    Their logarithms are normal around ``middle``.
+    """
     evidence = []
     for one in found:
         off = (np.log(one.solid.size[axis]) - middle) / SIZE
-        evidence.append(one.evidence - off * off / 2.0 + np.log(STEP / SIZE / np.sqrt(2.0 * np.pi)))
-    return found, evidence, STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
+        evidence.append(one.evidence - off * off / 2.0 + float(np.log(STEP / SIZE / np.sqrt(2.0 * np.pi))))
+    return evidence
+
+
+def _hidden_end(best: _Found, patch: Patch) -> tuple[int, float] | None:
+    """Return the axis and the side of the end that may be farthest behind an occluder, or None where none may be."""
+    ends = []
+    for axis in range(3) if best.start.kind == "box" else (2,):
+        for side in (-1.0, 1.0):
+            longer = _resized(best.solid, axis, LONGER * float(best.solid.size[axis]), side)
+            ends.append((_held(longer, axis, patch.fine).fit.cost, axis, side))
+    cost, axis, side = min(ends)
+    return (axis, side) if cost < best.fit.cost + UNLIKELY / 2.0 else None
 
 
 def _held(start: Solid, axis: int, level: Level) -> _Found:
@@ -444,10 +479,11 @@ def _held(start: Solid, axis: int, level: Level) -> _Found:
     return _run(start, level, PROFILE_STEPS, prior)
 
 
-def _spread(one: Estimate, axis: int, variance: float) -> Estimate:
-    """Return an estimate with a larger variance of the logarithm of a length whose end at the camera stays."""
+def _spread(one: Estimate, axis: int, variance: float, side: float = 0.0) -> Estimate:
+    """Return an estimate with a larger variance of the logarithm of a length, of which the end on a side moves."""
     lever, pose = np.zeros(9), one.solid.pose
-    lever[3:6] = np.sign(pose[:3, axis] @ pose[:3, 3]) * one.solid.size[axis] / 2.0 * pose[:3, axis]
+    moving = side or np.sign(pose[:3, axis] @ pose[:3, 3])
+    lever[3:6] = moving * one.solid.size[axis] / 2.0 * pose[:3, axis]
     lever[6 + axis] = 1.0
     return Estimate(one.solid, one.covariance + variance * np.outer(lever, lever))
 
