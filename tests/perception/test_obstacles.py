@@ -19,6 +19,7 @@ from apex_ompl.perception.synthetic import solid_part
 
 pytest.importorskip("cv2")
 
+from apex_ompl.perception.color_parts import Color, color_parts  # noqa: E402
 from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle  # noqa: E402
 from apex_ompl.perception.solid_fit import Estimate, KnownSize, Solid, mixture  # noqa: E402
 
@@ -165,6 +166,36 @@ def test_a_depth_that_is_not_seen_is_in_the_covariance() -> None:
 def axis_of(found: SeenObstacle) -> int:
     """Return the axis that is most along the line of sight."""
     return int(np.argmax(np.abs(found.pose[:3, :3].T @ EYE[:3, 2])))
+
+
+def test_an_end_behind_an_occluder_is_not_known() -> None:
+    size = np.array([0.06, 0.06, 0.3])
+    pose = placed(0.3, 0.0, 0.3, (np.pi / 2.0, 0.0, 0.0))
+    cylinder = solid_part(coal.Cylinder(size[0] / 2.0, size[2]), pose, 5, RED)
+    (whole,) = found_in([cylinder])
+    end = pose[:3, 3] + 0.11 * pose[:3, 2]
+    hiding = solid_part(coal.Box(0.02, 0.1, 0.2), placed(*(end + 0.25 * (EYE[:3, 3] - end))), 6, GRAY)
+    (partly,) = found_in([cylinder, hiding])
+    known, unknown = (np.sqrt(one.covariance[8, 8]) for one in (whole, partly))
+    assert known < 0.01
+    assert unknown > 0.03
+    off = partly.pose[:3, 3] - pose[:3, 3]
+    assert off @ np.linalg.solve(partly.covariance[3:6, 3:6], off) < 12.0
+    other = -np.sign(partly.pose[:3, 2] @ pose[:3, 2]) * partly.size[2] / 2.0 * partly.pose[:3, 2] + partly.pose[:3, 3]
+    np.testing.assert_allclose(other, pose[:3, 3] - 0.15 * pose[:3, 2], atol=0.01)
+
+
+def test_specks_of_the_color_do_not_widen_an_obstacle() -> None:
+    rng = np.random.default_rng(0)
+    own = np.zeros((60, 80), bool)
+    own[20:40, 30:50] = True
+    image = np.where((own | (rng.random(own.shape) < 0.15))[..., None], (190, 10, 10), (90, 90, 90)).astype(np.uint8)
+    depth = np.where(own, 1.0, 2.0)
+    (part,) = color_parts(image, depth, Color(0.0, 18.0, 0.55, 0.08), noise=0.003, least=60, largest=0.6)
+    found = np.zeros_like(own)
+    found[part.top : part.top + part.own.shape[0], part.left : part.left + part.own.shape[1]] = part.own
+    assert np.count_nonzero(found & ~own) == 0
+    assert np.count_nonzero(own & ~found) <= 4
 
 
 def test_a_square_front_is_a_cube_as_far_as_cubes_are_expected() -> None:
