@@ -32,7 +32,11 @@ if TYPE_CHECKING:
     from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
     from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
     from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
+    from apex_ompl.perception.solid_fit import KnownSize as KnownSize
     from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
+    from apex_ompl.perception.tracking import ObstacleTracker as ObstacleTracker
+    from apex_ompl.perception.tracking import TrackedObstacle as TrackedObstacle
+    from apex_ompl.perception.tracking import TrackerSettings as TrackerSettings
     from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
 __all__, __getattr__, __dir__ = lazy_names(
@@ -49,7 +53,9 @@ __all__, __getattr__, __dir__ = lazy_names(
         "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",
+        "solid_fit": "KnownSize",
         "synchronizer": "Synchronizer",
+        "tracking": "ObstacleTracker TrackedObstacle TrackerSettings",
         "twin_camera": "TwinCamera",
     },  # fmt: skip
 )

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 from apex_ompl.util.extras import import_extra
 
 
+@cache
 def opencv() -> Any:
     """Return the module ``cv2``.
 
@@ -24,4 +26,14 @@ def least_squares() -> Callable[..., Any]:
         MissingFileError: The extra ``perception`` is not installed.
     """
     found: Callable[..., Any] = import_extra("scipy.optimize", "least squares", "perception").least_squares
+    return found
+
+
+def assignment() -> Callable[..., Any]:
+    """Return ``scipy.optimize.linear_sum_assignment``.
+
+    Raises:
+        MissingFileError: The extra ``perception`` is not installed.
+    """
+    found: Callable[..., Any] = import_extra("scipy.optimize", "assignment", "perception").linear_sum_assignment
     return found

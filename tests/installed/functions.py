@@ -390,10 +390,14 @@ def _use_fits() -> None:
         AlignSettings,
         HeldObjectFinder,
         HeldSettings,
+        KnownSize,
         ObstacleFinder,
         ObstacleSettings,
+        ObstacleTracker,
         SeenObstacle,
         SeenTask,
+        TrackedObstacle,
+        TrackerSettings,
         vect_align,
     )
     from apex_ompl.perception.registration import corrected
@@ -412,8 +416,15 @@ def _use_fits() -> None:
     assert frame.color is not None and len(finder.expected(robot.home)) == 2
     obstacles = ObstacleFinder(ObstacleSettings())
     assert obstacles.colored(frame.color).any()
-    for seen in obstacles.find(corrected(frame, RobotSurface(robot), None), frame.color):
+    given, tracker = corrected(frame, RobotSurface(robot), None), ObstacleTracker(TrackerSettings(births=1, of=1))
+    found = obstacles.find(given, frame.color)
+    for seen in found:
         assert isinstance(seen, SeenObstacle) and seen.place_spread > 0.0 and seen.obstacle("red", 1.0).name == "red"
+    for tracked in tracker.update(frame.stamp, found, given):
+        assert isinstance(tracked, TrackedObstacle) and tracked.place_covariance.shape == (3, 3)
+        assert tracked.obstacle(2.0).name == tracked.solid.name == tracked.name and not tracker.gone
+        size = tracked.known_size()
+        assert isinstance(size, KnownSize) and obstacles.find(given, frame.color, known=[size])
     alignment = Alignment(kind="vertical", first=attached[0].name, second=attached[1].name)
     task = vect_align(frame, robot, attached, alignment, AlignSettings(obstacles=None))
     assert isinstance(task, SeenTask) and bool(task) == (not task.reasons)

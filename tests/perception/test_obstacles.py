@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
+from dataclasses import replace
 
 import coal
 import numpy as np
@@ -17,7 +19,9 @@ from apex_ompl.perception.synthetic import solid_part
 
 pytest.importorskip("cv2")
 
+from apex_ompl.perception.color_parts import Color, color_parts  # noqa: E402
 from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle  # noqa: E402
+from apex_ompl.perception.solid_fit import Estimate, KnownSize, Solid, mixture  # noqa: E402
 
 CAMERA = Camera(width=320, height=240, focal=(232.0, 232.0), center=(159.5, 119.5), depth=DepthErrors())
 EYE = look_at((1.0, 0.1, 0.9), (0.3, 0.0, 0.3))
@@ -30,16 +34,17 @@ def placed(x: float, y: float, z: float, turn: tuple[float, float, float] = (0.0
 
 
 def found_in(
-    parts: list[Part], settings: ObstacleSettings | None = None, gain: float = 0.5, seed: int = 0
-) -> tuple[SeenObstacle, ...]:
+    parts: list[Part], settings: ObstacleSettings | None = None, *, gain: float = 0.5, seed: int = 0,
+    known: Sequence[KnownSize] = (),
+) -> tuple[SeenObstacle, ...]:  # fmt: skip
     rng = np.random.default_rng(seed)
     floor = solid_part(coal.Box(4.0, 4.0, 0.02), placed(0.0, 0.0, 0.0), 9, GRAY)
     everything = [*parts, floor]
     view = ZBuffer().draw(everything, CAMERA, EYE)
     depth = DepthSensor(gain=gain).measure(view, CAMERA, rng)[0]
-    known = Registration(EYE, 1.0, np.zeros(0), np.diag([1e-4] * 3 + [3e-4] * 3 + [1e-4]) ** 2, 0, 0)
-    seen = CorrectedFrame(CAMERA, depth, known, gain * CAMERA.depth.noise)
-    return ObstacleFinder(settings).find(seen, colors(view, everything, LIGHT, rng))
+    registered = Registration(EYE, 1.0, np.zeros(0), np.diag([1e-4] * 3 + [3e-4] * 3 + [1e-4]) ** 2, 0, 0)
+    seen = CorrectedFrame(CAMERA, depth, registered, gain * CAMERA.depth.noise)
+    return ObstacleFinder(settings).find(seen, colors(view, everything, LIGHT, rng), known=known)
 
 
 CASES = {
@@ -103,17 +108,141 @@ def test_what_the_image_cuts_and_what_is_too_large_or_elsewhere() -> None:
     assert found_in([]) == ()
 
 
-def test_an_obstacle_s_margins_are_its_deviations() -> None:
-    solid, pose, _ = CASES["cube"]
+def test_an_obstacle_grows_by_the_deviations_of_its_ends() -> None:
+    solid, pose, _ = CASES["lying box"]
     (found,) = found_in([solid_part(solid, pose, 5, RED)])
-    exact, wide = found.obstacle("red"), found.obstacle("red", 2.0)
-    assert exact.box is not None
+    assert found.obstacle("red").box == pytest.approx(tuple(found.size))
+    np.testing.assert_allclose(found.obstacle("red").pose, found.pose, atol=1e-9)
+    known = found.covariance.copy()
+    known[:3] = known[:, :3] = 0.0  # without turns, whose effect is bounded only
+    still = replace(found, covariance=known)
+    rotation, zero, unit = found.pose[:3, :3], np.zeros((3, 3)), np.eye(3) / 2.0
+    ends = np.block([[zero, rotation.T, -unit], [zero, rotation.T, unit]])
+    deviations = np.sqrt(np.diag(ends @ known @ ends.T))
+    wide = still.obstacle("red", 2.0)
     assert wide.box is not None
-    np.testing.assert_allclose(exact.box, found.size)
-    own = found.pose[:3, :3].T @ found.covariance[3:6, 3:6] @ found.pose[:3, :3]
-    ends = np.sqrt(np.diag(own) + np.diag(found.covariance[6:, 6:]) / 4.0)
-    np.testing.assert_allclose(np.array(wide.box) - exact.box, 4.0 * ends)
-    np.testing.assert_allclose(exact.pose, found.pose, atol=1e-9)
+    own = (wide.pose[:3, 3] - found.pose[:3, 3]) @ rotation
+    np.testing.assert_allclose((found.size - wide.box) / 2.0 + own, -2.0 * deviations[:3], atol=1e-9)
+    np.testing.assert_allclose((wide.box - found.size) / 2.0 + own, 2.0 * deviations[3:], atol=1e-9)
+    turned = found.obstacle("red", 2.0).box
+    assert turned is not None
+    assert (np.array(turned) >= wide.box).all()
+
+
+def test_growth_holds_turned_solids_and_is_bounded() -> None:
+    pose, size = placed(0.3, 0.1, 0.3, (0.6, 0.3, 0.2)), np.array([0.1, 0.25, 0.15])
+    for angle in (0.02, 0.1, 2.0):
+        covariance = np.zeros((9, 9))
+        covariance[:3, :3] = angle**2 * np.eye(3)
+        wide = SeenObstacle("box", pose, size, covariance, False, 100).obstacle("red", 1.0)
+        corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * size
+        assert wide.box is not None
+        assert max(wide.box) <= np.linalg.norm(size) + 1e-9
+        for axis in np.eye(3):
+            turned = corners @ np.asarray(pin.exp3(angle * axis)).T
+            assert (np.abs(turned) <= np.array(wide.box) / 2.0 + angle**2 * 0.1).all()
+
+
+FACING = placed(0.3, 0.0, 0.3) @ np.array([[*EYE[:3, 2], 0], [*EYE[:3, 0], 0], [*EYE[:3, 1], 0], [0, 0, 0, 1]]).T
+"""A pose whose x is the line of sight."""
+
+
+def test_a_depth_that_is_not_seen_is_in_the_covariance() -> None:
+    size = np.array([0.09, 0.15, 0.2])
+    (found,) = found_in([solid_part(coal.Box(*size), FACING, 5, RED)])
+    sight, off = EYE[:3, 2], found.pose[:3, 3] - FACING[:3, 3]
+    deviation = np.sqrt(sight @ found.covariance[3:6, 3:6] @ sight)
+    assert deviation > 0.02
+    assert abs(off @ sight) < 2.5 * deviation
+    across = off - (off @ sight) * sight
+    assert np.linalg.norm(across) < 0.005
+    front = found.pose[:3, 3] - found.size[axis_of(found)] / 2.0 * sight
+    assert abs((front - FACING[:3, 3]) @ sight + size[0] / 2.0) < 0.006
+    (end,) = (one.box for one in [found.obstacle("red", 2.0)])
+    assert end is not None
+    assert max(end) > 0.2
+
+
+def axis_of(found: SeenObstacle) -> int:
+    """Return the axis that is most along the line of sight."""
+    return int(np.argmax(np.abs(found.pose[:3, :3].T @ EYE[:3, 2])))
+
+
+def test_an_end_behind_an_occluder_is_not_known() -> None:
+    size = np.array([0.06, 0.06, 0.3])
+    pose = placed(0.3, 0.0, 0.3, (np.pi / 2.0, 0.0, 0.0))
+    cylinder = solid_part(coal.Cylinder(size[0] / 2.0, size[2]), pose, 5, RED)
+    (whole,) = found_in([cylinder])
+    end = pose[:3, 3] + 0.11 * pose[:3, 2]
+    hiding = solid_part(coal.Box(0.02, 0.1, 0.2), placed(*(end + 0.25 * (EYE[:3, 3] - end))), 6, GRAY)
+    (partly,) = found_in([cylinder, hiding])
+    known, unknown = (np.sqrt(one.covariance[8, 8]) for one in (whole, partly))
+    assert known < 0.01
+    assert unknown > 0.03
+    off = partly.pose[:3, 3] - pose[:3, 3]
+    assert off @ np.linalg.solve(partly.covariance[3:6, 3:6], off) < 12.0
+    other = -np.sign(partly.pose[:3, 2] @ pose[:3, 2]) * partly.size[2] / 2.0 * partly.pose[:3, 2] + partly.pose[:3, 3]
+    np.testing.assert_allclose(other, pose[:3, 3] - 0.15 * pose[:3, 2], atol=0.01)
+
+
+def test_specks_of_the_color_do_not_widen_an_obstacle() -> None:
+    rng = np.random.default_rng(0)
+    own = np.zeros((60, 80), bool)
+    own[20:40, 30:50] = True
+    image = np.where((own | (rng.random(own.shape) < 0.15))[..., None], (190, 10, 10), (90, 90, 90)).astype(np.uint8)
+    depth = np.where(own, 1.0, 2.0)
+    (part,) = color_parts(image, depth, Color(0.0, 18.0, 0.55, 0.08), noise=0.003, least=60, largest=0.6)
+    found = np.zeros_like(own)
+    found[part.top : part.top + part.own.shape[0], part.left : part.left + part.own.shape[1]] = part.own
+    assert np.count_nonzero(found & ~own) == 0
+    assert np.count_nonzero(own & ~found) <= 4
+
+
+def test_a_square_front_is_a_cube_as_far_as_cubes_are_expected() -> None:
+    parts = [solid_part(coal.Box(0.15, 0.15, 0.15), FACING, 5, RED)]
+    (expected,) = found_in(parts, ObstacleSettings(cubes=0.5))
+    np.testing.assert_allclose(expected.size, 0.15, atol=0.008)
+    assert expected.place_spread < 0.03
+    (open_minded,) = found_in(parts, ObstacleSettings(cubes=0.0))
+    assert open_minded.place_spread > 0.02
+    assert np.sort(open_minded.covariance.diagonal()[6:])[-1] > 0.03**2
+
+
+def test_an_obstacle_of_known_size_is_placed_by_its_front() -> None:
+    size = np.array([0.09, 0.15, 0.2])
+    parts = [solid_part(coal.Box(*size), FACING, 5, RED)]
+    (found,) = found_in(parts, known=[KnownSize("box", size[[2, 0, 1]]), KnownSize("cylinder", size)])
+    assert np.linalg.norm(found.pose[:3, 3] - FACING[:3, 3]) < 0.005
+    np.testing.assert_allclose(np.sort(found.size), size, atol=0.002)
+    assert found.place_spread < 0.01
+    (other,) = found_in(parts, known=[KnownSize("box", np.full(3, 0.3))])
+    np.testing.assert_allclose(np.sort(np.delete(other.size, axis_of(other))), size[1:], atol=0.01)
+
+
+def test_a_narrow_strip_of_a_side_tells_the_depth() -> None:
+    """Without noise: pixels that a drawing does not cover lengthen that side, they do not widen the front."""
+    pose = FACING.copy()
+    pose[:3, :3] = pose[:3, :3] @ np.asarray(pin.exp3(np.array([0.0, 0.3, 0.0])))
+    size = np.array([0.2, 0.12, 0.16])
+    (found,) = found_in([solid_part(coal.Box(*size), pose, 5, RED)], gain=0.05)
+    np.testing.assert_allclose(np.sort(found.size), np.sort(size), atol=0.01)
+
+
+def test_a_mixture_has_the_moments_of_its_samples() -> None:
+    rng, parts, samples = np.random.default_rng(5), [], []
+    for odds, length, deviation in ((1.0, 0.1, 0.01), (3.0, 0.16, 0.03)):
+        pose = np.eye(4)
+        pose[:3, 3] = 0.0, length, 1.0
+        covariance = np.diag([0.01] * 3 + [deviation] * 3 + [0.05] * 3) ** 2
+        parts.append((np.log(odds), Estimate(Solid("box", np.array([0.1, length, 0.2]), pose), covariance)))
+        size = rng.normal(0.0, 0.05, (int(odds * 40000), 3)) * (0.1, length, 0.2) + (0.1, length, 0.2)
+        samples.append(np.hstack([rng.normal(0.0, deviation, size.shape) + pose[:3, 3], size]))
+    found = mixture(parts)
+    assert found is not None
+    drawn = np.concatenate(samples)
+    np.testing.assert_allclose([*found.solid.pose[:3, 3], *found.solid.size], drawn.mean(axis=0), atol=1e-3)
+    scale = np.array([1.0, 1.0, 1.0, *found.solid.size])
+    np.testing.assert_allclose(found.covariance[3:, 3:] * np.outer(scale, scale), np.cov(drawn.T), atol=3e-5)
 
 
 def test_hues_are_those_of_colorsys() -> None:
@@ -130,7 +259,19 @@ def test_hues_are_those_of_colorsys() -> None:
                 assert mask[row, column] == (margins > 0.0).all()
 
 
-@pytest.mark.parametrize("fields", [{"hue": 400.0}, {"hue_width": 0.0}, {"largest": -1.0}, {"high": (0.0, -2.0, 0.0)}])
+def test_bad_sizes_are_refused() -> None:
+    for kind, size, spread in (
+        ("ball", (1.0, 1.0, 1.0), 0.1),
+        ("box", (1.0, 0.0, 1.0), 0.1),
+        ("box", (1.0, 1.0, 1.0), 0.0),
+    ):
+        with pytest.raises(ParameterError):
+            KnownSize(kind, np.array(size), spread)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "fields", [{"hue": 400.0}, {"hue_width": 0.0}, {"largest": -1.0}, {"high": (0.0, -2.0, 0.0)}, {"cubes": 1.0}]
+)
 def test_bad_settings_are_refused(fields: dict[str, float]) -> None:
     with pytest.raises(ParameterError):
         ObstacleSettings(**fields)  # type: ignore[arg-type]

@@ -106,10 +106,10 @@ def _chamfer(distance: Floats) -> None:
 
 
 @inlined
-def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, float]:
-    """Return the triangle of the drawn pixel nearest to a pixel, or -1 for none within ``REACH``, and its distance."""
+def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, int, float]:
+    """Return row and column of the drawn pixel nearest to a pixel, -1 for none within ``REACH``, and its distance."""
     height, width = index.shape
-    best, found = REACH * REACH + 1, -1
+    best, line, place = REACH * REACH + 1, -1, -1
     for r in range(REACH + 1):
         if r * r >= best:
             break
@@ -120,8 +120,8 @@ def _seen_beside(index: Integers, row: int, column: int) -> tuple[int, float]:
                 if 0 <= i < height and 0 <= j < width and index[i, j] >= 0:
                     apart = (i - row) * (i - row) + (j - column) * (j - column)
                     if apart < best:
-                        best, found = apart, index[i, j]
-    return found, math.sqrt(best)
+                        best, line, place = apart, i, j
+    return line, place, math.sqrt(best)
 
 
 @inlined
@@ -135,17 +135,23 @@ def _closest(placed: Floats, a: int, b: int, c: int, x: float, y: float, z: floa
 
 
 @inlined
-def _add(matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, weight: float, r: float) -> None:
-    """Add a residual with its derivatives by unknowns and by the camera to the normal equations."""
-    n = len(vector)
-    for k in range(n):
+def _add(
+    matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, weight: float, r: float, final: bool
+) -> None:  # fmt: skip
+    """Add a residual with its derivatives by unknowns to the normal equations, whose matrix gets its lower half.
+
+    Those by the camera are added at the ``final`` step only.
+    """
+    for k in range(len(vector)):
         if row[k] == 0.0:
             continue
-        vector[k] -= weight * r * row[k]
-        for m in range(n):
-            matrix[k, m] += weight * row[k] * row[m]
-        for m in range(CAMERA):
-            cross[k, m] += weight * row[k] * camera[m]
+        scaled = weight * row[k]
+        vector[k] -= scaled * r
+        for m in range(k + 1):
+            matrix[k, m] += scaled * row[m]
+        if final:
+            for m in range(CAMERA):
+                cross[k, m] += scaled * camera[m]
 
 
 @inlined
@@ -278,15 +284,18 @@ def fit_surface(
                 cross[k, m] = 0.0
         cutoff = max(last, first * 0.7**step) if step < steps else last
         cost = _add_points(
-            points, outline, lens, faces, ties, symmetry, rotation, position, settings, cutoff, placed, index, matrix,
-            vector, cross, row, camera,
+            points, outline, lens, faces, ties, symmetry, rotation, position, settings, cutoff, placed, depth, index,
+            matrix, vector, cross, row, camera, step == steps,
         )  # fmt: skip
         cost += _add_contour(
             beyond, outline < len(points), lens, ties, symmetry, rotation, position, settings, depth, index, matrix,
-            vector, cross, row, camera,
+            vector, cross, row, camera, step == steps,
         )  # fmt: skip
         cost += _add_prior(matrix, vector, prior, rotation, position, scale, ties, prior_rotation, prior_position, row)
         if step == steps:
+            for k in range(len(vector)):
+                for m in range(k):
+                    matrix[m, k] = matrix[k, m]
             break
         _copy(matrix, factor)
         if not _solve(factor, vector):
@@ -331,7 +340,8 @@ def _move(step: Floats, rotation: Floats, position: Floats, scale: Floats, ties:
 def _add_points(
     points: Floats, outline: int, lens: Floats, faces: Integers, ties: Integers, symmetry: int, rotation: Floats,
     position: Floats, settings: tuple[float, float, float, float, float, float, float, float], cutoff: float,
-    placed: Floats, index: Integers, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+    placed: Floats, depth: Floats, index: Integers, matrix: Floats, vector: Floats, cross: Floats, row: Floats,
+    camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residuals of points from the drawn surface to the normal equations, and return their cost."""
     noise, floor, edge, point_share, contour_share, _, last, reach = settings
@@ -346,9 +356,16 @@ def _add_points(
         if seen and p >= outline:
             continue
         share, largest = (point_share, cutoff) if p < outline else (contour_share, max(cutoff, reach))
-        apart = 0.0
         if inside and not seen:
-            k, apart = _seen_beside(index, line, column)
+            i, j, apart = _seen_beside(index, line, column)
+            if i >= 0:
+                k = index[i, j]
+                if p >= outline:
+                    cost += _add_uncovered(
+                        i, j, line - i, column - j, apart, lens, ties, symmetry, rotation, position, settings, largest,
+                        depth, matrix, vector, cross, row, camera, final,
+                    )  # fmt: skip
+                    continue
         if k < 0:
             cost += share / 3.0 * (last / (noise * z * z + floor)) ** 2
             continue
@@ -358,16 +375,11 @@ def _add_points(
             r = nx * (x - placed[a, 0]) + ny * (y - placed[a, 1]) + nz * (z - placed[a, 2])
         else:
             qx, qy, qz = _closest(placed, a, b, c, x, y, z)
-            if p >= outline:  # at the depth of the surface
-                x, y, z = x * qz / z, y * qz / z, qz
-                qx, qy, qz = _closest(placed, a, b, c, x, y, z)
             nx, ny, nz = x - qx, y - qy, z - qz
             r = math.sqrt(nx * nx + ny * ny + nz * nz)
             if r < 1e-9:
                 continue
             nx, ny, nz = nx / r, ny / r, nz / r
-            if p >= outline:  # as far as the outline is from a pixel that it covers too much
-                r = (apart - 0.5) * z / lens[0]
         cosine = (nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
         across = edge * z / lens[0]
         variance = noise * noise * z * z * z * z * cosine * cosine + floor * floor
@@ -379,19 +391,56 @@ def _add_points(
         _surface_row(row, rotation, position, ties, symmetry, x - r * nx, y - r * ny, z - r * nz, -nx, -ny, -nz)
         camera[0], camera[1], camera[2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
         camera[3], camera[4], camera[5], camera[6] = nx, ny, nz, nx * x + ny * y + nz * z
-        _add(matrix, vector, cross, row, camera, share * weight / variance, r)
+        _add(matrix, vector, cross, row, camera, share * weight / variance, r, final)
     return cost
+
+
+@inlined
+def _add_uncovered(
+    i: int, j: int, down: int, right: int, apart: float, lens: Floats, ties: Integers, symmetry: int, rotation: Floats,
+    position: Floats, settings: tuple[float, float, float, float, float, float, float, float], largest: float,
+    depth: Floats, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, final: bool,
+) -> float:  # fmt: skip
+    """Add the residual of a pixel of the object that the drawing does not cover, and return its cost.
+
+    The drawn pixel (i, j) is the nearest, and has to move towards that pixel in the image.
+    """
+    _, floor, edge, _, share, _, _, _ = settings
+    z = depth[i, j]
+    x, y = (j - lens[2]) / lens[0] * z, (i - lens[3]) / lens[1] * z
+    pixel = z / lens[0]
+    r = (apart - 0.5) * pixel  # the border is between the centers of pixels
+    weight, loss = _robust(r, largest)
+    variance = edge * edge * pixel * pixel + floor * floor
+    if weight > 0.0:
+        gu, gv = -right / apart, -down / apart
+        _contour_row(row, camera, ties, symmetry, rotation, position, x, y, z, gu, gv)
+        _add(matrix, vector, cross, row, camera, share * weight / variance, r, final)
+    lost: float = share * loss * largest * largest / variance
+    return lost
+
+
+@inlined
+def _contour_row(
+    row: Floats, camera: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats, x: float, y: float,
+    z: float, gu: float, gv: float,
+) -> None:  # fmt: skip
+    """Set the derivatives of a residual that grows in the image along (gu, gv) with a point of the contour."""
+    gz = -(gu * x + gv * y) / z
+    _surface_row(row, rotation, position, ties, symmetry, x, y, z, gu, gv, gz)
+    camera[0], camera[1], camera[2] = -(y * gz - z * gv), -(z * gu - x * gz), -(x * gv - y * gu)
+    camera[3], camera[4], camera[5], camera[6] = -gu, -gv, -gz, 0.0
 
 
 @outlined
 def _add_contour(
     beyond: Floats, known: bool, lens: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats,
     settings: tuple[float, float, float, float, float, float, float, float], depth: Floats, index: Integers,
-    matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats,
+    matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residuals of the drawing's contour from what may be covered, and return their cost.
 
-    Where the outline is known, parts of the contour that agree with it count, too.
+    Where the outline is known, parts of the contour that agree with it and the border of the window count, too.
     """
     _, floor, edge, _, share, _, _, reach = settings
     height, width = index.shape
@@ -400,7 +449,8 @@ def _add_contour(
         for j in range(1, width - 1):
             if index[i, j] < 0 or (beyond[i, j] == 0.0 and not known):
                 continue
-            if index[i - 1, j] >= 0 and index[i + 1, j] >= 0 and index[i, j - 1] >= 0 and index[i, j + 1] >= 0:
+            inner = index[i - 1, j] >= 0 and index[i + 1, j] >= 0 and index[i, j - 1] >= 0 and index[i, j + 1] >= 0
+            if inner and not (known and (i == 1 or j == 1 or i == height - 2 or j == width - 2)):
                 continue
             gu, gv = (beyond[i, j + 1] - beyond[i, j - 1]) / 2.0, (beyond[i + 1, j] - beyond[i - 1, j]) / 2.0
             if not (math.isfinite(gu) and math.isfinite(gv)):
@@ -419,11 +469,8 @@ def _add_contour(
             cost += share * loss * reach * reach / variance
             if weight == 0.0:
                 continue
-            gz = -(gu * x + gv * y) / z
-            _surface_row(row, rotation, position, ties, symmetry, x, y, z, gu, gv, gz)
-            camera[0], camera[1], camera[2] = -(y * gz - z * gv), -(z * gu - x * gz), -(x * gv - y * gu)
-            camera[3], camera[4], camera[5], camera[6] = -gu, -gv, -gz, 0.0
-            _add(matrix, vector, cross, row, camera, share * weight / variance, r)
+            _contour_row(row, camera, ties, symmetry, rotation, position, x, y, z, gu, gv)
+            _add(matrix, vector, cross, row, camera, share * weight / variance, r, final)
     return cost
 
 

@@ -1,0 +1,716 @@
+"""Fit of boxes and cylinders of unknown pose and size to the pixels of an obstacle.
+
+Normals of its points tell how it may be turned, and their extents its size; the fit of surfaces
+(:mod:`apex_ompl.kernel.perception`) finds pose and size. Hypotheses that differ in the length that is seen least, and
+that of a cube, are a mixture: its mean and covariance are the answer (Laplace's approximation of their evidence,
+MacKay 2003, chapter 27).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import permutations
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from apex_ompl.errors import ParameterError
+from apex_ompl.kernel.perception import AXIS, FitSettings, SurfaceFit, Window, fit_surface
+from apex_ompl.perception.color_parts import APART, BEFORE, PAD, ColorPart
+from apex_ompl.perception.library import opencv
+from apex_ompl.perception.registration import CorrectedFrame
+from apex_ompl.perception.rendering import lens_of
+from apex_ompl.perception.surfaces import Surface, body_surface
+from apex_ompl.scene.bodies import Body
+from apex_ompl.types import Array, Indices
+from apex_ompl.util.validation import check_array, check_positive, finite_array
+
+Mask = NDArray[np.bool_]
+Kind = Literal["box", "cylinder"]
+
+COARSE, FINE = 45, 90  # width or height of windows [pixels]
+COARSE_POINTS = 120
+COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at most
+COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 5, 5, 3
+RIVALS, RIVAL = 3, 1.3  # fits that are refined at most, and their largest cost over the least
+NORMALS = 150  # that are compared at most
+SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
+SQUARE = 0.5  # cosine between normals of different sides
+THICK = 0.012  # distance from a plane of its points [m]
+THIN, THICK_SHARE = 0.35, 0.8  # shares of the width of what may be the depth of a box, and of what surely is
+PAIRS = np.random.default_rng(0).random((60, 2))  # of normals whose common perpendicular may be an axis
+FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
+SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
+STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
+UNLIKELY, MOST_LENGTHS = 14.0, 8  # cost above the least where lengths of the mixture end, and their number
+SHARP = 0.09  # standard deviation of the logarithm of a length below which it has no mixture
+VAGUE = 0.06  # standard deviation of the logarithm of a length above which it has a mixture of its own
+KNOWN = 1e8  # information of what is no unknown
+HELD = 1e6  # of the logarithm of a length that is held
+MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
+PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
+HIDDEN = 0.03  # share of the border beside an occluder from which on an end may be hidden
+LONGER = 1.3  # ratio of lengths that tells whether one is
+NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
+NOT_SQUARE = 0.06  # logarithm of the ratio of sides from which on a box is no cube, beside the errors
+SLICES = 32
+ORDERS = tuple(permutations(range(3)))  # of known lengths along the axes of a box
+
+
+@dataclass(frozen=True)
+class Weights:
+    """How much measurements say; as in :class:`apex_ompl.perception.obstacles.ObstacleSettings`."""
+
+    floor: float
+    edge: float
+    point_share: float
+    contour_share: float
+    inflation: float
+    most_points: int
+    smallest: float
+    largest: float
+    cubes: float
+
+
+@dataclass(frozen=True, eq=False)
+class KnownSize:
+    """The size of an obstacle that is known before it is seen.
+
+    Attributes:
+        kind: ``box`` or ``cylinder`` along z.
+        size: Lengths along its axes, of a cylinder diameter, diameter and length, shape (3,) [m].
+        spread: Standard deviation of each length [m].
+    """
+
+    kind: Kind
+    size: Array
+    spread: float = 0.001
+
+    def __post_init__(self) -> None:
+        """Check the ranges.
+
+        Raises:
+            ParameterError: The kind is another, or lengths are not positive.
+        """
+        if self.kind not in get_args(Kind):
+            raise ParameterError("kind", self.kind, f"one of {', '.join(get_args(Kind))}")
+        size = finite_array(self.size, "size")
+        check_array(size, (3,), "size")
+        if not (size > 0.0).all():
+            raise ParameterError("size", size.tolist(), "three positive lengths")
+        object.__setattr__(self, "size", size)
+        check_positive(self.spread, "spread")
+
+
+class Solid(NamedTuple):
+    """A solid: its kind, lengths, shape (3,) [m], and pose in the optical frame, shape (4, 4) [m]."""
+
+    kind: Kind
+    size: Array
+    pose: Array
+
+
+class Estimate(NamedTuple):
+    """A solid with the covariance of turn, shift and logarithms of lengths in the optical frame, shape (9, 9)."""
+
+    solid: Solid
+    covariance: Array
+
+
+class Level(NamedTuple):
+    """The pixels of an obstacle at a resolution.
+
+    Attributes:
+        window: The window.
+        points: Measured points in the optical frame, then points at the border, or whose depths are their neighbors',
+            shape (N, 3) [m].
+        measured: Number of measured points.
+        beyond: Distances of pixels from those that it may cover, shape (h, w) [pixels of the window].
+        lens: Lens of the window.
+        settings: Weights of a fit.
+    """
+
+    window: Window
+    points: Array
+    measured: int
+    beyond: Array
+    lens: Array
+    settings: FitSettings
+
+
+class Patch(NamedTuple):
+    """The pixels of an obstacle.
+
+    Attributes:
+        coarse: For the search.
+        fine: For the answer.
+        extent: Points, those at the border with guessed depths, shape (M, 3) [m].
+        places: Smoothed points of its surface, shape (K, 3) [m].
+        normals: Normals there, shape (K, 3).
+        cut: Whether the image cuts it.
+        hidden: Whether an occluder is beside it.
+        pixels: Number of pixels with depth.
+    """
+
+    coarse: Level
+    fine: Level
+    extent: Array
+    places: Array
+    normals: Array
+    cut: bool
+    hidden: bool
+    pixels: int
+
+
+class _Found(NamedTuple):
+    """A fit from a start."""
+
+    start: Solid
+    fit: SurfaceFit
+    prior: Array
+    unknowns: list[int]  # of turn, shift and each length
+
+    @property
+    def solid(self) -> Solid:
+        """The solid that was found."""
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = self.fit.rotation, self.fit.position
+        return Solid(self.start.kind, self.start.size * self.fit.scale, pose)
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the evidence by Laplace's approximation."""
+        spread = np.linalg.slogdet(self.fit.information)[1] - np.linalg.slogdet(self.prior)[1]
+        return -(self.fit.cost + float(spread)) / 2.0
+
+
+def patch_of(part: ColorPart, seen: CorrectedFrame, weights: Weights, least: int) -> Patch | None:
+    """Return the pixels of a part; None where fewer than ``least`` have a depth."""
+    cv, camera = opencv(), seen.camera
+    rows, columns = np.flatnonzero(part.own.any(axis=1)), np.flatnonzero(part.own.any(axis=0))
+    if not len(rows):
+        return None
+    bottom, right = rows[-1] + part.top, columns[-1] + part.left
+    top, left = rows[0] + part.top, columns[0] + part.left
+    cut = top < 2 or left < 2 or bottom > camera.height - 3 or right > camera.width - 3
+    crop = slice(max(0, rows[0] - PAD), rows[-1] + PAD + 1), slice(max(0, columns[0] - PAD), columns[-1] + PAD + 1)
+    own, guess = part.own[crop], part.filled[crop]
+    corner = part.top + crop[0].start, part.left + crop[1].start
+    depth = seen.depth[corner[0] : corner[0] + own.shape[0], corner[1] : corner[1] + own.shape[1]]
+    measured = own & (depth > 0.0) & (np.abs(depth - guess) < APART)
+    pixels = int(np.count_nonzero(measured))
+    if pixels < least:
+        return None
+    inner = cv.erode(own.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1) > 0
+    sure = measured & inner  # depths at the border are often wrong
+    if np.count_nonzero(sure) < least:
+        sure = measured
+    occluder = (depth > 0.0) & (depth < guess - BEFORE) & ~own
+    covered = own | occluder | part.maybe[crop]
+    border = (cv.dilate(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~own
+    hidden = np.count_nonzero(border & occluder) > HIDDEN * np.count_nonzero(border)
+    lens = lens_of(camera)
+
+    def level(size: int, most: int, most_guessed: int) -> tuple[Level, Array]:
+        stride = -(-max(own.shape) // size)
+        height, width = own.shape[0] // stride, own.shape[1] // stride
+        window = Window(int(corner[1]), int(corner[0]), width, height, stride)
+        cells = slice(0, height * stride, stride), slice(0, width * stride, stride)
+        own_lens = window.lens(lens)
+        beyond = cv.distanceTransform((~covered[cells]).astype(np.uint8), cv.DIST_L2, 5).astype(float)
+        good, all_good = sure[cells], own[cells]
+        points, guessed = _points(guess[cells], good, own_lens), _points(guess[cells], all_good & ~good, own_lens)
+        kept = points[_spaced(len(points), most)]
+        settings = _fit_settings(weights, stride, len(points) / max(len(kept), 1), seen)
+        every = np.concatenate([kept, guessed[_spaced(len(guessed), most_guessed)]])
+        return Level(window, every, len(kept), beyond, own_lens, settings), np.concatenate([points, guessed])
+
+    fine, _ = level(FINE, weights.most_points, FINE_GUESSED)
+    coarse, extent = level(COARSE, COARSE_POINTS, COARSE_GUESSED)
+    stride = coarse.window.stride
+    grid = _grid(guess[::stride, ::stride], Window(corner[1], corner[0], 0, 0, stride).lens(lens))
+    places, normals = _normals(grid, measured[::stride, ::stride])
+    return Patch(coarse, fine, extent, places, normals, bool(cut), bool(hidden), pixels)
+
+
+def _fit_settings(weights: Weights, stride: int, thinning: float, seen: CorrectedFrame) -> FitSettings:
+    shared = max(1.0, (seen.camera.depth.correlation / stride) ** 2)
+    return FitSettings(
+        noise=seen.noise, floor=weights.floor, edge=weights.edge,
+        point_share=weights.point_share * thinning / shared / weights.inflation,
+        contour_share=weights.contour_share * stride / weights.inflation, first=0.04, last=0.02, reach=0.02,
+        steps=FINE_STEPS,
+    )  # fmt: skip
+
+
+def _spaced(count: int, most: int) -> Indices:
+    """Return up to ``most`` numbers below ``count``, equally spaced."""
+    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
+
+
+def _points(depth: Array, chosen: Mask, lens: Array) -> Array:
+    """Return the points of chosen pixels of a depth image in the optical frame, shape (N, 3) [m]."""
+    rows, columns = np.nonzero(chosen)
+    z = depth[rows, columns]
+    return np.stack([(columns - lens[2]) / lens[0] * z, (rows - lens[3]) / lens[1] * z, z], axis=-1)
+
+
+def _grid(depth: Array, lens: Array) -> Array:
+    """Return the points of a depth image in the optical frame, shape (h, w, 3) [m]."""
+    rows, columns = np.ogrid[0 : depth.shape[0], 0 : depth.shape[1]]
+    return np.stack([(columns - lens[2]) / lens[0] * depth, (rows - lens[3]) / lens[1] * depth, depth], axis=-1)
+
+
+def _normals(grid: Array, measured: Mask) -> tuple[Array, Array]:
+    """Return smoothed points and normals there by differences over a distance of pixels, both of shape (K, 3)."""
+    cv, r = opencv(), max(2, round(np.sqrt(np.count_nonzero(measured)) / 6.0))
+    weight = measured.astype(float)
+    share = cv.blur(weight, (r, r), borderType=cv.BORDER_CONSTANT)
+    smooth = cv.blur(grid * weight[..., None], (r, r), borderType=cv.BORDER_CONSTANT)
+    smooth /= np.maximum(share, 1e-9)[..., None]
+    good = share > 0.6
+    if min(good.shape) <= 2 * r:
+        return np.empty((0, 3)), np.empty((0, 3))
+    inner = good[2 * r :, r:-r] & good[: -2 * r, r:-r] & good[r:-r, 2 * r :] & good[r:-r, : -2 * r]
+    rows, columns = np.nonzero(inner)
+    step = max(1, len(rows) // NORMALS)
+    rows, columns = rows[::step] + r, columns[::step] + r
+    down = smooth[rows + r, columns] - smooth[rows - r, columns]
+    across = smooth[rows, columns + r] - smooth[rows, columns - r]
+    normals = _crosses(down, across)
+    normals /= np.maximum(np.sqrt((normals * normals).sum(axis=1, keepdims=True)), 1e-12)
+    return smooth[rows, columns], np.asarray(normals)
+
+
+def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence[KnownSize] = ()) -> Estimate | None:
+    """Return the solid of a patch; None where no fit found any.
+
+    Args:
+        patch: Its pixels.
+        seen: The frame.
+        weights: How much measurements say.
+        known: Sizes that it may have, or others.
+    """
+    best = _searched(patch)
+    if best is None:
+        return None
+    misfit = max(1.0, best.fit.cost / (patch.fine.settings.point_share * patch.fine.measured) / MISFIT)
+    sized = _of_known_size(best, patch, known)
+    if sized is not None:
+        return _estimate(sized, misfit, seen)
+    parts = _hypotheses(best, misfit, patch, seen, weights)
+    if best.start.kind == "box" and weights.cubes > 0.0 and _square(parts[0][1]):
+        cube = _cube(best, patch)
+        parts = [(one + float(np.log(1.0 - weights.cubes)), solid) for one, solid in parts]
+        parts.append((cube.evidence + float(np.log(weights.cubes)), _estimate(cube, misfit, seen)))
+    return mixture(parts)
+
+
+def _hypotheses(
+    best: _Found, misfit: float, patch: Patch, seen: CorrectedFrame, weights: Weights
+) -> list[tuple[float, Estimate]]:  # fmt: skip
+    """Return estimates of different lengths along the axis that is known least, with logarithms of their evidence."""
+    alone = _estimate(best, misfit, seen)
+    end = _hidden_end(best, patch) if patch.hidden else None
+    axis, side = end if end is not None else (_vague_axis(alone), 0.0)
+    if axis is None:
+        return [(best.evidence, alone)]
+    held, deviation = _profile(best, axis, side, patch, weights)
+    if len(held) == 1 or deviation < SHARP:
+        more = misfit * deviation**2 - alone.covariance[6 + axis, 6 + axis]
+        return [(best.evidence, _spread(alone, axis, max(0.0, more)))]
+    lengths = best.solid.size if end is not None else np.delete(best.solid.size, axis)
+    odds = _odds(held, axis, float(np.log(lengths[axis] if end is not None else lengths).mean()))
+    likely = [k for k, one in enumerate(odds) if one > max(odds) - NEGLIGIBLE]
+    return [(odds[k], _spread(_estimate(held[k], misfit, seen), axis, STEP**2 / 12.0, side)) for k in likely]
+
+
+def _searched(patch: Patch) -> _Found | None:
+    """Return the best fit from all starts."""
+    found = [_run(one, patch.coarse, COARSE_STEPS) for one in _starts(patch)]
+    found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
+    if not found:
+        return None
+    rivals: list[_Found] = []
+    for one in found:
+        if one.fit.cost > RIVAL * found[0].fit.cost or len(rivals) == RIVALS:
+            break
+        if not any(_alike(one.solid, other.solid) for other in rivals):
+            rivals.append(one)
+    refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals]
+    refined = [one for one in refined if np.isfinite(one.fit.cost)]
+    return min(refined, key=lambda one: one.fit.cost) if refined else None
+
+
+def _alike(first: Solid, second: Solid) -> bool:
+    """Return whether two solids are nearly the same."""
+    apart = np.abs(first.pose[:3, 3] - second.pose[:3, 3]).max()
+    larger = np.abs(np.log(np.sort(first.size) / np.sort(second.size))).max()
+    return first.kind == second.kind and bool(apart < SAME_PLACE and larger < SAME_SIZE)
+
+
+def _run(
+    start: Solid, level: Level, steps: int, prior: Array | None = None, ties: tuple[int, int, int] | None = None
+) -> _Found:
+    """Return the fit from a start."""
+    surface = _unit(start.kind)
+    symmetry = 0 if start.kind == "box" else AXIS
+    tied = np.array(ties if ties is not None else (0, 1, 2) if start.kind == "box" else (0, 0, 2))
+    before = _prior(start.kind) if prior is None else prior
+    s = level.settings
+    settings = FitSettings(
+        s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach, steps
+    )  # fmt: skip
+    fit = fit_surface(
+        level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry,
+        start.pose, start.pose, before, settings, level.measured,
+    )  # fmt: skip
+    return _Found(start, fit, before, [*range(6), *(6 + tied)])
+
+
+def _prior(kind: Kind) -> Array:
+    """Return the information before a fit, shape (9, 9)."""
+    prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
+    if kind == "cylinder":  # both diameters are one unknown
+        prior[7, 7] = KNOWN
+    return prior
+
+
+@cache
+def _unit(kind: Kind) -> Surface:
+    """Return the surface of a solid whose lengths are 1 m."""
+    shape: dict[str, object] = {"box": (1.0, 1.0, 1.0)}
+    if kind == "cylinder":
+        shape = {"cylinder": {"radius": 0.5, "length": 1.0}}
+    return body_surface(Body.model_validate({"name": "obstacle", **shape}), SLICES)
+
+
+def _estimate(found: _Found, factor: float, seen: CorrectedFrame) -> Estimate:
+    """Return the solid that was found with its covariance; variances of measurements grow by a factor."""
+    own = np.linalg.inv(found.prior + (found.fit.information - found.prior) / factor)
+    lever = own @ found.fit.cross / factor
+    covariance = own + lever @ seen.registration.covariance @ lever.T
+    return Estimate(found.solid, covariance[np.ix_(found.unknowns, found.unknowns)])
+
+
+def _vague_axis(one: Estimate) -> int | None:
+    """Return the axis whose length is least known, or None where all are known.
+
+    It is that of the side that is seen most, where this is most of what is seen.
+    """
+    solid, sight = one.solid, one.solid.pose[:3, 3]
+    area = np.abs(solid.pose[:3, :3].T @ sight) * np.prod(solid.size) / solid.size
+    if solid.kind == "cylinder":
+        around = float(np.hypot(area[0], area[1]))
+        return 2 if area[2] * np.pi / 4.0 > FRONT * (area[2] * np.pi / 4.0 + around) else None
+    axis = int(np.argmax(area))
+    spread = np.sqrt(np.diag(one.covariance)[6:])
+    if area[axis] > FRONT * area.sum():
+        return axis
+    return int(np.argmax(spread)) if spread.max() > VAGUE else None
+
+
+def _resized(solid: Solid, axis: int, length: float, side: float = 0.0) -> Solid:
+    """Return a solid with another length along an axis, where the end on a side moves, by default that far away."""
+    pose, size = solid.pose.copy(), solid.size.copy()
+    moving = side or np.sign(pose[:3, axis] @ pose[:3, 3])
+    pose[:3, 3] += moving * (length - size[axis]) / 2.0 * pose[:3, axis]
+    size[axis] = length
+    if solid.kind == "cylinder" and axis < 2:
+        size[:2] = length
+    return Solid(solid.kind, size, pose)
+
+
+def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weights) -> tuple[list[_Found], float]:
+    """Return fits with lengths along an axis that are held, of which the end on a side moves.
+
+    Lengths grow and, where the side is 0, fall from the best one by a ratio until their costs are too large. The second
+    is the standard deviation of the logarithm of the length, by the costs of its neighbors.
+    """
+    first = best.solid.size[axis]
+    center = _held(best.solid, axis, patch.fine)
+    found, least, rises = [center], min(best.fit.cost, center.fit.cost), []
+    for ratio in (np.exp(STEP), np.exp(-STEP)) if side == 0.0 else (np.exp(STEP),):
+        solid, length = best.solid, first * ratio
+        for k in range(MOST_LENGTHS):
+            if not 0.5 * weights.smallest < length < weights.largest:
+                break
+            one = _held(_resized(solid, axis, length, side), axis, patch.fine)
+            if k == 0:
+                rises.append(one.fit.cost - best.fit.cost)
+            if not one.fit.cost < least + UNLIKELY:
+                break
+            found.append(one)
+            solid, least, length = one.solid, min(least, one.fit.cost), length * ratio
+    return found, STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
+
+
+def _odds(found: Sequence[_Found], axis: int, middle: float) -> list[float]:
+    """Return the logarithms of the evidence of fits with lengths that are held, with the density of these.
+
+    Their logarithms are normal around ``middle``.
+    """
+    evidence = []
+    for one in found:
+        off = (np.log(one.solid.size[axis]) - middle) / SIZE
+        evidence.append(one.evidence - off * off / 2.0 + float(np.log(STEP / SIZE / np.sqrt(2.0 * np.pi))))
+    return evidence
+
+
+def _hidden_end(best: _Found, patch: Patch) -> tuple[int, float] | None:
+    """Return the axis and the side of the end that may be farthest behind an occluder, or None where none may be."""
+    ends = []
+    for axis in range(3) if best.start.kind == "box" else (2,):
+        for side in (-1.0, 1.0):
+            longer = _resized(best.solid, axis, LONGER * float(best.solid.size[axis]), side)
+            ends.append((_held(longer, axis, patch.fine).fit.cost, axis, side))
+    cost, axis, side = min(ends)
+    return (axis, side) if cost < best.fit.cost + UNLIKELY / 2.0 else None
+
+
+def _held(start: Solid, axis: int, level: Level) -> _Found:
+    """Return the fit with a length that is held."""
+    prior = _prior(start.kind)
+    prior[6 + axis, 6 + axis] = HELD
+    return _run(start, level, PROFILE_STEPS, prior)
+
+
+def _spread(one: Estimate, axis: int, variance: float, side: float = 0.0) -> Estimate:
+    """Return an estimate with a larger variance of the logarithm of a length, of which the end on a side moves."""
+    lever, pose = np.zeros(9), one.solid.pose
+    moving = side or np.sign(pose[:3, axis] @ pose[:3, 3])
+    lever[3:6] = moving * one.solid.size[axis] / 2.0 * pose[:3, axis]
+    lever[6 + axis] = 1.0
+    return Estimate(one.solid, one.covariance + variance * np.outer(lever, lever))
+
+
+def _front(solid: Solid) -> int:
+    """Return the axis of the side that is seen most."""
+    return int(np.argmax(np.abs(solid.pose[:3, :3].T @ solid.pose[:3, 3]) / solid.size))
+
+
+def _square(one: Estimate) -> bool:
+    """Return whether the side of a box that is seen most may be that of a cube."""
+    first, second = (k for k in range(3) if k != _front(one.solid))
+    size, variance = one.solid.size, np.diag(one.covariance)[6:]
+    return bool(
+        abs(np.log(size[first] / size[second])) < NOT_SQUARE + 4.0 * np.sqrt(variance[first] + variance[second])
+    )
+
+
+def _cube(best: _Found, patch: Patch) -> _Found:
+    """Return the fit of a cube, whose front is that of a box."""
+    solid = best.solid
+    front = _front(solid)
+    side = float(np.sqrt(np.delete(solid.size, front).prod()))
+    return _run(
+        Solid("box", np.full(3, side), _resized(solid, front, side).pose), patch.fine, FINE_STEPS, ties=(0, 0, 0)
+    )
+
+
+def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _Found | None:
+    """Return the best fit of a known size, or None where none fits as well as a size of its own."""
+    found: list[tuple[float, int, _Found, Array]] = []
+    for one in known:
+        solid = best.solid if one.kind == best.start.kind else None
+        if solid is None:
+            continue
+        orders = ORDERS if one.kind == "box" else ORDERS[:1]
+        for size in dict.fromkeys(tuple(one.size[list(order)].tolist()) for order in orders):
+            start = solid
+            for axis in range(3):
+                start = _resized(start, axis, float(size[axis]))
+            prior = _prior(one.kind)
+            for axis in range(3) if one.kind == "box" else (0, 2):
+                prior[6 + axis, 6 + axis] = (size[axis] / one.spread) ** 2
+            coarse = _run(start, patch.coarse, PROFILE_STEPS, prior)
+            found.append((coarse.fit.cost, len(found), coarse, prior))
+    refined = [
+        _run(Solid(one.start.kind, one.start.size, one.solid.pose), patch.fine, FINE_STEPS, prior)
+        for cost, _, one, prior in sorted(found)[:RIVALS]
+        if np.isfinite(cost)
+    ]
+    likely = [one for one in refined if one.fit.cost < best.fit.cost + UNLIKELY]
+    return min(likely, key=lambda one: one.fit.cost) if likely else None
+
+
+def mixture(parts: list[tuple[float, Estimate]]) -> Estimate | None:
+    """Return the mean and the covariance of hypotheses; turns are those of the most likely one."""
+    if not parts:
+        return None
+    evidence = np.array([one for one, _ in parts])
+    parts = [one for one, value in zip(parts, evidence, strict=True) if value > evidence.max() - NEGLIGIBLE]
+    evidence = np.array([one for one, _ in parts])
+    weight = np.exp(evidence - evidence.max())
+    weight /= weight.sum()
+    best = parts[int(np.argmax(weight))][1].solid
+    means = np.array(
+        [
+            [*pin.log3(one.solid.pose[:3, :3] @ best.pose[:3, :3].T), *one.solid.pose[:3, 3], *one.solid.size]
+            for _, one in parts
+        ]
+    )
+    mean = weight @ means
+    covariance = np.zeros((9, 9))
+    for share, value, (_, one) in zip(weight, means, parts, strict=True):
+        scale = np.concatenate([np.ones(6), one.solid.size])
+        off = value - mean
+        covariance += share * (one.covariance * np.outer(scale, scale) + np.outer(off, off))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = pin.exp3(mean[:3]) @ best.pose[:3, :3], mean[3:6]
+    scale = np.concatenate([np.ones(6), 1.0 / mean[6:]])
+    return Estimate(Solid(best.kind, mean[6:], pose), covariance * np.outer(scale, scale))
+
+
+def _plane(places: Array, normals: Array) -> Array | None:
+    """Return the normal of the plane through the places of the largest group of like normals; None without normals."""
+    if not len(normals):
+        return None
+    alike = normals @ normals.T > SAME_WAY
+    group = alike[int(np.argmax(alike.sum(axis=1)))]
+    mean = normals[group].mean(axis=0)
+    mean /= np.sqrt(mean @ mean)
+    for _ in range(2):
+        height = places @ mean
+        near = group & (np.abs(height - _middle(height[group])) < THICK)
+        if np.count_nonzero(near) < 6:
+            break
+        own = places[near] - places[near].mean(axis=0)
+        found = np.linalg.eigh(own.T @ own)[1][:, 0]
+        mean = found * np.sign(found @ mean)
+    return np.asarray(mean)
+
+
+def _round_axis(normals: Array) -> Array | None:
+    """Return the axis to which most normals are perpendicular or, those of a cap, parallel (RANSAC); None for few."""
+    if len(normals) < 8:
+        return None
+    pairs = (PAIRS * len(normals)).astype(np.int64)
+    axes = _crosses(normals[pairs[:, 0]], normals[pairs[:, 1]])
+    lengths = np.sqrt((axes * axes).sum(axis=1))
+    if not (lengths > 0.3).any():
+        return None
+    axes = axes[lengths > 0.3] / lengths[lengths > 0.3, None]
+    along = np.abs(normals @ axes.T)
+    best = int(np.argmax((along < 0.2).sum(axis=0) + (along > 0.95).sum(axis=0)))
+    side = normals[along[:, best] < 0.25]
+    return np.asarray(np.linalg.eigh(side.T @ side)[1][:, 0])
+
+
+def _starts(patch: Patch) -> list[Solid]:
+    """Return boxes and cylinders from which fits start, in the optical frame."""
+    first = _plane(patch.places, patch.normals)
+    if first is None:
+        first = -patch.extent.mean(axis=0)
+        first /= np.sqrt(first @ first)
+    rest = np.abs(patch.normals @ first) < SQUARE
+    enough = np.count_nonzero(rest) > max(3.0, 0.06 * len(patch.normals))
+    second = _plane(patch.places[rest], patch.normals[rest]) if enough else None
+    frames = [_frame(first, second if second is not None else _longest(patch.extent, first))]
+    if second is None:  # one side is seen, or a round one
+        frames += [_turned(frames[0], np.pi / 4.0), _squared(patch.extent, first)]
+    starts = [one for frame in frames for one in _boxes(frame, patch)]
+    axes = [first] if second is None else [first, second]
+    round_one = _round_axis(patch.normals)
+    if round_one is not None:
+        axes.append(round_one)
+    return starts + [one for axis in axes for one in _cylinders(axis, patch)]
+
+
+def _frame(first: Array, second: Array) -> Array:
+    """Return a rotation whose x is the first vector and whose y is in the plane of both."""
+    y = second - (second @ first) * first
+    y /= np.sqrt(y @ y)
+    return np.stack([first, y, _cross(first, y)], axis=1)
+
+
+def _turned(frame: Array, angle: float) -> Array:
+    """Return a rotation turned about its x [rad]."""
+    return np.asarray(frame @ pin.exp3(np.array([angle, 0.0, 0.0])))
+
+
+def _longest(points: Array, normal: Array) -> Array:
+    """Return the direction across a normal in which points extend most."""
+    flat = points - points.mean(axis=0)
+    flat = flat - (flat @ normal)[:, None] * normal
+    return np.asarray(np.linalg.eigh(flat.T @ flat)[1][:, 2])
+
+
+def _squared(points: Array, normal: Array) -> Array:
+    """Return the rotation whose x is a normal, along the sides of the smallest rectangle around points across it."""
+    y = _longest(points, normal)
+    z = _cross(normal, y)
+    flat = np.stack([points @ y, points @ z], axis=-1).astype(np.float32)
+    angle = np.radians(opencv().minAreaRect(flat)[2])
+    return _frame(normal, np.cos(angle) * y + np.sin(angle) * z)
+
+
+def _boxes(frame: Array, patch: Patch) -> list[Solid]:
+    """Return a box of the points' extents and, where it is flat, one that is as deep as it is wide."""
+    along = patch.extent @ frame
+    low, high = _extent(along)
+    solid = _solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0)
+    share = solid.size[0] / solid.size[1:].mean()
+    return ([solid] if share > THIN else []) + ([_deep(solid, 0)] if share < THICK_SHARE else [])
+
+
+def _middle(values: Array) -> float:
+    """Return a median."""
+    return float(np.partition(values, len(values) // 2)[len(values) // 2])
+
+
+def _extent(along: Array) -> tuple[Array, Array]:
+    """Return the first and the last percentile of each column."""
+    order = np.sort(along, axis=0)
+    skipped = len(order) // 100
+    return order[skipped], order[-1 - skipped]
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Return the vector product of two vectors, shape (3,); NumPy's takes ten times as long."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _crosses(a: Array, b: Array) -> Array:
+    """Return the vector products of rows, shape (N, 3)."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
+def _deep(solid: Solid, axis: int) -> Solid:
+    """Return a solid at least as deep along an axis as it is wide across it."""
+    others = float(np.delete(solid.size, axis).mean())
+    return _resized(solid, axis, max(others, float(solid.size[axis])))
+
+
+def _cylinders(axis: Array, patch: Patch) -> list[Solid]:
+    """Return cylinders along an axis whose outline and front are those of the points."""
+    points = patch.extent
+    sight = points.mean(axis=0)
+    across = _cross(axis, sight)
+    seen_end = float(np.abs(axis @ sight) / np.sqrt(sight @ sight))  # cosine
+    if across @ across < 0.0004 * (sight @ sight):  # along the line of sight
+        across = _longest(points, axis)
+    across /= np.sqrt(across @ across)
+    frame = np.stack([across, _cross(axis, across), axis], axis=1)
+    along = points @ frame
+    low, high = _extent(along)
+    size, middle = np.maximum(high - low, 0.01), (high + low) / 2.0
+    away = frame.T @ sight
+    radius = float(size[0]) / 2.0
+    if seen_end < 0.8 and size[2] > 0.4 * radius:
+        middle[1] = low[1] + radius if away[1] > 0.0 else high[1] - radius
+    solid = _solid("cylinder", np.array([2.0 * radius, 2.0 * radius, size[2]]), frame, middle)
+    return [_deep(solid, 2) if seen_end > 0.6 else solid]
+
+
+def _solid(kind: Kind, size: Array, frame: Array, middle: Array) -> Solid:
+    pose = np.eye(4)
+    pose[:3, :3] = frame if np.linalg.det(frame) > 0.0 else frame * (1.0, 1.0, -1.0)
+    pose[:3, 3] = frame @ middle
+    return Solid(kind, np.maximum(size, 0.01), pose)
