@@ -26,7 +26,8 @@ from apex_ompl.types import Array
 CAMERA = 7  # errors of a camera: turn, shift, scale of depths
 MEASURED = 0.999  # share of the grasp's variance below which a look has measured a direction
 ROUNDS = 3  # of the linearization of turns
-APART = 4.0  # mean squared difference of looks over what their covariances explain above which the object has moved
+LARGE = 1.5  # mean squared difference of looks above which their covariances are too small
+APART = 4.0  # mean squared difference of looks over what their covariances explain above which one is wrong
 
 
 class Sighting(NamedTuple):
@@ -73,19 +74,13 @@ def fused(sightings: Sequence[Sighting], link: Array, settings: HeldSettings) ->
         return _moved_along(sightings[-1], link)
     if len(answers) == 1:
         return _moved_along(answers[0], link)
-    names = list(dict.fromkeys(one.seen.camera.name for one in answers))
     spread = np.array([*np.radians(settings.grasp_turn), *settings.grasp_shift])
-    grasp = last.body.pose
-    best = min(answers, key=lambda one: float(np.trace(one.held.covariance / np.outer(spread, spread))))
-    pose = inverse(best.link) @ best.held.pose
-    solution, information, excess = np.zeros(6), np.eye(6), 1.0
-    for _ in range(ROUNDS):
-        expected = _off(grasp, pose) / spread
-        rows = [_rows(one, pose, expected, spread) for one in answers]
-        cameras = [names.index(one.seen.camera.name) for one in answers]
-        solution, information, excess = _solved(rows, cameras, len(names), expected)
-        pose = _shifted(pose, spread * solution)
-    covariance = np.asarray(np.linalg.inv(information)[:6, :6] * np.outer(spread, spread) * max(1.0, excess), float)
+    pose, covariance, excess = _fused(answers, spread)
+    if excess > APART and len(answers) > 2:
+        parts = [[one for one in answers if one is not left] for left in answers]
+        fits = [_fused(part, spread) for part in parts]
+        least = min(range(len(fits)), key=lambda k: fits[k][2])
+        answers, (pose, covariance, excess) = parts[least], fits[least]
     scale, size = _size([one.held for one in answers], settings)
     reason = ""
     if excess > APART:
@@ -95,6 +90,27 @@ def fused(sightings: Sequence[Sighting], link: Array, settings: HeldSettings) ->
         max(one.held.seen for one in answers), max(one.held.points for one in answers),
         min(one.held.misfit for one in answers),
     )  # fmt: skip
+
+
+def _fused(answers: Sequence[Sighting], spread: Array) -> tuple[Array, Array, float]:
+    """Return the pose in the frame of the link, its covariance, and the mean squared difference of the looks.
+
+    Args:
+        answers: The looks.
+        spread: Standard deviations of the grasp's turn and shift along the axes of the link, shape (6,).
+    """
+    names = list(dict.fromkeys(one.seen.camera.name for one in answers))
+    cameras = [names.index(one.seen.camera.name) for one in answers]
+    best = min(answers, key=lambda one: float(np.trace(one.held.covariance / np.outer(spread, spread))))
+    pose, information, excess = inverse(best.link) @ best.held.pose, np.eye(6), 1.0
+    for _ in range(ROUNDS):
+        expected = _off(best.held.body.pose, pose) / spread
+        rows = [_rows(one, pose, expected, spread) for one in answers]
+        solution, information, excess = _solved(rows, cameras, len(names), expected)
+        pose = _shifted(pose, spread * solution)
+    growth = excess if excess > LARGE else 1.0
+    covariance = np.asarray(np.linalg.inv(information)[:6, :6] * np.outer(spread, spread) * growth, float)
+    return pose, covariance, excess
 
 
 def _moved_along(one: Sighting, link: Array) -> HeldObject:
