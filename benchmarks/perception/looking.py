@@ -14,7 +14,7 @@ answer whose errors are larger than the tolerance, "offer" the mean number of th
 the share of objects within the 95 % ellipsoid; "fused" are objects with answers in two looks or more, not those that
 one look found. In brackets: each seed. Times are CPU times of a first call that seeks states, on one core.
 
-Usage: python -m benchmarks.perception.looking [-n 75] [--cameras 1] [--tune]
+Usage: python -m benchmarks.perception.looking [-n 150] [--mujoco 75] [--cameras 1] [--tune]
 """
 
 from __future__ import annotations
@@ -399,7 +399,8 @@ def tables(drawn: dict[str, dict[int, list[Sample]]]) -> tuple[dict[str, Any], s
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = record.parser(__doc__ or "", 75, "tasks of a seed and a renderer")
+    parser = record.parser(__doc__ or "", 150, "tasks of a seed, drawn by the kernel")
+    parser.add_argument("--mujoco", type=int, default=75, help="tasks of a seed, drawn by MuJoCo")
     parser.add_argument("--cameras", type=int, default=1, help="number of cameras")
     parser.add_argument("--tune", action="store_true", help="print errors on seeds that are not reported")
     given = parser.parse_args()
@@ -408,8 +409,9 @@ def main() -> None:
         print(tables(drawn)[1])
         return
     drawn = {
-        type(renderer).__name__: {seed: samples(renderer, seed, given.n, given.cameras) for seed in SEEDS}
-        for renderer in (ZBuffer(), Mujoco())
+        type(renderer).__name__: {seed: samples(renderer, seed, count, given.cameras) for seed in SEEDS}
+        for renderer, count in ((ZBuffer(), given.n), (Mujoco(), given.mujoco))
+        if count > 0
     }
     data, text = tables(drawn)
     name = "perception_looking" if given.cameras == 1 else f"perception_looking_{given.cameras}_cameras"
