@@ -50,13 +50,13 @@ class Sighting(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Measurements along directions that are independent of each other, in units of the grasp's deviations.
+    """What a look measured, in units of the grasp's standard deviations.
 
     Attributes:
-        directions: Shape (n, 6).
-        camera: Derivatives by the camera's errors, in units of their deviations, shape (n, 7).
+        directions: Directions that it measured, shape (n, 6).
+        camera: Derivatives by the errors of calibration, in units of their standard deviations, shape (n, 7).
         values: Shape (n,).
-        information: Shape (n,).
+        information: Inverse of their covariance, shape (n, n).
     """
 
     directions: Array
@@ -148,15 +148,17 @@ def _rows(one: Sighting, pose: Array, expected: Array, spread: Array) -> _Rows:
     deviations = np.maximum(
         [*[camera.angle_spread] * 3, *[camera.position_spread] * 3, camera.depth.scale_spread], 1e-6
     )  # fmt: skip
-    left = calibration / deviations  # of the calibration's error, by the error in units of its deviations
-    common = np.kron(np.eye(2), rotation) @ one.held.lever @ left / spread[:, None]
-    own = covariance - common @ common.T
+    lever = np.kron(np.eye(2), rotation) @ one.held.lever / spread[:, None]
+    own = covariance - lever @ calibration @ lever.T
     variances, vectors = np.linalg.eigh((own + own.T) / 2.0)
     kept = variances < MEASURED
     variance, directions = np.maximum(variances[kept], 1e-6), vectors[:, kept].T
-    information = 1.0 / variance - 1.0
-    values = (directions @ value / variance - directions @ expected) / information
-    return _Rows(directions, (directions @ common) / (variance * information)[:, None], values, information)
+    precision = 1.0 / variance - 1.0  # without the grasp's
+    values = (directions @ value / variance - directions @ expected) / precision
+    slopes = directions @ lever / (variance * precision)[:, None]
+    left = calibration / deviations  # of the calibration's errors, in units of their standard deviations
+    noise = np.diag(1.0 / precision) + slopes @ (calibration - left @ left.T) @ slopes.T
+    return _Rows(directions, slopes @ left, values, np.asarray(np.linalg.inv(noise), float))
 
 
 def _solved(
@@ -172,13 +174,14 @@ def _solved(
         matrix[:, :6] = one.directions
         first = 6 + CAMERA * number
         matrix[:, first : first + CAMERA] = one.camera
-        information = information + matrix.T @ (one.information[:, None] * matrix)
-        vector = vector + matrix.T @ (one.information * one.values)
+        information = information + matrix.T @ one.information @ matrix
+        vector = vector + matrix.T @ one.information @ one.values
         matrices.append(matrix)
     solution = np.asarray(np.linalg.solve(information, vector), float)
     cost = float(np.sum((solution[:6] - expected) ** 2) + np.sum(solution[6:] ** 2))
     for one, matrix in zip(rows, matrices, strict=True):
-        cost += float(one.information @ (one.values - matrix @ solution) ** 2)
+        off = one.values - matrix @ solution
+        cost += float(off @ one.information @ off)
     return solution[:6], information, cost / max(1, sum(len(one.values) for one in rows))
 
 
