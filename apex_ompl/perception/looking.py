@@ -190,7 +190,8 @@ def look_states(
 
     States that show all wanted objects well enough come first, then those that show some of them, each by its expected
     standard deviations and its distance. If none shows all, look from the first one, then ask again for the objects
-    that it did not show. Hands stay closed as they are.
+    that it did not show, or take the order of :func:`look_plan`. Hands stay closed as they are. There is no state where
+    none was found in which a fit is expected to find an object.
 
     Args:
         robot: The robot.
@@ -215,7 +216,8 @@ def look_states(
     q = q.clip(robot.limits.lower, robot.limits.upper)
     wanted = _wanted(attached, names)
     checker = checker_of(world, robot, attached)
-    kept = ConstraintSet.of(robot, constraints, attached, q) if constraints else None
+    closed = any(one.links is not None for one in attached)
+    kept = ConstraintSet.of(robot, constraints, attached, q) if constraints or closed else None
     search = _Search(checker, {k: LinkFace.of_object(attached[k]) for k in wanted}, q, s, kept)
     predictor = ViewPredictor(
         robot, attached, checker.obstacles.values(), settings=held, seed=s.seed, surface=surface
@@ -229,9 +231,28 @@ def look_states(
             break
     found: list[LookState] = []
     for look in sorted(looks, key=lambda one: _cost(one, s)):
-        if all(look.camera != one.camera or _apart(look.state, one.state) >= s.apart for one in found):
+        shows = any(not view.reason for view in look.objects)
+        if shows and all(look.camera != one.camera or _apart(look.state, one.state) >= s.apart for one in found):
             found.append(look)
     return tuple(found[: s.most])
+
+
+def look_plan(looks: Iterable[LookState]) -> tuple[LookState, ...]:
+    """Return the states, one after the other, that together show all objects that any of them shows well enough.
+
+    Args:
+        looks: States from :func:`look_states`, the best first.
+    """
+    left, chosen = list(looks), list[LookState]()
+    shown: set[str] = set()
+    while left:
+        best = max(left, key=lambda one: len({*one.names} - shown))  # the first one of several
+        if not {*best.names} - shown:
+            break
+        chosen.append(best)
+        left.remove(best)
+        shown |= {*best.names}
+    return tuple(chosen)
 
 
 def _apart(first: Array, second: Array) -> float:
