@@ -193,11 +193,16 @@ def looks_of(frames: Sequence[Frame]) -> list[list[Frame]]:
             raise ParameterError("frames", frame, "frames")
         if frame.joints.keys() != frames[0].joints.keys():
             raise ParameterError("frames", sorted(frame.joints), "the same joints in all frames")
-        own = next((look for look in looks if look[0].camera == frame.camera and _moved(look[0], frame) <= STILL), None)
+        own = next((look for look in looks if _same_look(look, frame)), None)
         if own is not None:
             looks.remove(own)
         looks.append([*(own or ()), frame])
     return looks
+
+
+def _same_look(look: Sequence[Frame], frame: Frame) -> bool:
+    """Whether a frame is of the camera of a look, with the robot in its state."""
+    return look[0].camera == frame.camera and all(_moved(one, frame) <= STILL for one in look)
 
 
 def _moved(first: Frame, second: Frame) -> float:

@@ -12,7 +12,7 @@ import pytest
 from apex_ompl.errors import ParameterError
 from apex_ompl.perception import Camera, Frame
 from apex_ompl.perception.camera import DepthErrors
-from apex_ompl.perception.frames import looks_of
+from apex_ompl.perception.frames import looks_of, mean_frame
 from apex_ompl.perception.fusion import SHARED, Sighting, fused
 from apex_ompl.perception.held import NOT_THERE, HeldObject, HeldSettings
 from apex_ompl.perception.registration import CorrectedFrame, Registration
@@ -172,6 +172,8 @@ def test_frames_are_grouped_into_looks() -> None:
               frame(other, 5e-4, 0.4)]  # fmt: skip
     looks = looks_of(frames)
     assert [[one.stamp for one in look] for look in looks] == [[0.0, 0.2], [0.3], [0.1, 0.4]]
+    drift = looks_of([frame(CAMERA, 1.5e-3 * k, 0.1 * k) for k in range(4)])
+    assert [mean_frame(look).stamp for look in drift] == pytest.approx([0.1, 0.3])  # none of which has moved
     with pytest.raises(ParameterError, match="one frame or more"):
         looks_of([])
     with pytest.raises(ParameterError, match="the same joints"):
