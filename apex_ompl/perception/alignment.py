@@ -2,7 +2,8 @@
 
 The objects in the hands are found (:mod:`apex_ompl.perception.held`), their contact faces are the vectors to be
 aligned, and obstacles of a color are found (:mod:`apex_ompl.perception.obstacles`). Where something is not known well
-enough for the task's tolerance there is no task, but a sentence that says why.
+enough for the task's tolerance there is no task, but a sentence that says why, and states from which a camera sees it
+(:mod:`apex_ompl.perception.looking`).
 """
 
 from __future__ import annotations
@@ -152,12 +153,13 @@ def vect_align(
     states: tuple[LookState, ...] = ()
     sought = [one.name for one in chosen if one.name in unknown and one.body.contact is not None]
     if world is not None and trusted and sought:
-        limits = _limits(alignment, len(chosen), s)
+        place, turn = _limits(alignment, len(chosen), s)
+        cameras = {look.frame.camera.name: look.frame.camera for look in trusted}
+        reported = [look.frame.state(robot.joint_names) for look in looks]
         states = look_states(
-            robot, seen, sought, list({look.frame.camera.name: look.frame.camera for look in trusted}.values()),
-            now.state, world=world, held=s.held, constraints=constraints, surface=surface,
-            settings=replace(s.look, place=LOOKED * limits[0], turn=LOOKED * limits[1], seed=s.look.seed + len(looks)),
-            avoided=[look.seen.registration.state for look in looks],
+            robot, seen, sought, list(cameras.values()), reported[-1], world=world, held=s.held, avoided=reported,
+            constraints=constraints, surface=surface,
+            settings=replace(s.look, place=LOOKED * place, turn=LOOKED * turn, seed=s.look.seed + len(looks)),
         )  # fmt: skip
         if not states:
             reasons.append(f"no free state was found from which a camera sees {' or '.join(map(repr, sought))}")
