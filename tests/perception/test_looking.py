@@ -188,6 +188,18 @@ def test_a_camera_that_sees_nothing_gives_no_state_and_another_one_is_chosen(
     assert found and {one.camera for one in found} == {"other"}
 
 
+def test_a_camera_on_a_hand_sees_what_the_other_hand_holds(problem: Problem, robot: Robot, start: Array) -> None:
+    pose = look_at((0.06, 0.0, 0.0), (0.06, 0.0, 1.0))
+    own = default_camera(SyntheticSettings()).placed(pose).model_copy(update={"link": "left_link7"})
+    settings = LookSettings(proposals=40, predicted=8, distance=(0.4, 0.8))
+    found = states_to_look_from(robot, problem.attached, "upper", own, start, settings=settings)
+    assert found and found[0].names == ("upper",)
+    predictor = ViewPredictor(robot, problem.attached)
+    seen = predictor.visible(own, found[0].state, settings.least_cosine)[1]
+    assert (seen.surface, seen.face) == (found[0].objects[0].share, found[0].objects[0].face)
+    assert seen.surface > 0.1
+
+
 def test_a_plan_of_looks_covers_all_objects_with_few_states(looks: tuple[LookState, ...]) -> None:
     assert look_plan(looks) == looks[:1]
 
