@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -60,7 +60,7 @@ from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
-from benchmarks.perception.held import CHI_SQUARED, DIMENSIONS, MEDIAN, band, squared_error, table
+from benchmarks.perception.held import CHI_SQUARED, DIMENSIONS, MEDIAN, band, compact, squared_error, table
 
 DEPENDS = (
     "apex_ompl/perception/looking.py", "apex_ompl/perception/visibility.py", "apex_ompl/perception/fusion.py",
@@ -288,7 +288,7 @@ def run_task(number: int, rng: np.random.Generator, renderer: Renderer, cameras:
     for k, (one, before) in enumerate(zip(last.held, first.held, strict=True)):
         true = stage.poses(state)[k]
         face, axis = errors(one, true)
-        off = face > min(tolerance.lateral, tolerance.axial) or np.radians(axis) > tolerance.angle
+        off = bool(face > min(tolerance.lateral, tolerance.axial) or np.radians(axis) > tolerance.angle)
         found.append(
             Sample(
                 number, name, _kind(one.body), len(offers), tuple(offers), bool(last), one.reason, face, axis, off,
@@ -392,9 +392,7 @@ def tables(drawn: dict[str, dict[int, list[Sample]]]) -> tuple[dict[str, Any], s
         for name, by_seed in drawn.items() for found in by_seed.values() for one in found if not one.answered
     ]  # fmt: skip
     text = [table(TASKS, tasks), table(HEAD, rows), table(SQUARED, squared), table(MISSED, missed)]
-    return {"tasks": tasks, "rows": rows, "squared": squared, "samples": [asdict(one) for one in every]}, "\n\n".join(
-        text
-    )
+    return {"tasks": tasks, "rows": rows, "squared": squared, "samples": compact(every)}, "\n\n".join(text)
 
 
 def main() -> None:
