@@ -53,6 +53,8 @@ ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in whi
 MISFIT, GROWTH = 1.2, 1.5  # mean squared error of points over that of noise above which variances grow, and its power
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
+NOT_THERE = "no surface is seen where the hand holds it"
+FARTHEST = 36.0  # squared error of six dimensions that a grasp exceeds three times in a million
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
 
 
@@ -134,6 +136,8 @@ class HeldObject:
         seen: Share of the object's outline that was measured.
         points: Number of pixels that may be the object's.
         misfit: Mean robust squared error of its points over what noise explains; infinite without an answer.
+        lever: Derivatives of its turn and shift by the remaining turn, shift and scale of the camera, the former in the
+            axes of the world, the latter in those of the optical frame, shape (6, 7); zeros without an answer.
     """
 
     body: AttachedObject
@@ -145,6 +149,7 @@ class HeldObject:
     seen: float = 0.0
     points: int = 0
     misfit: float = np.inf
+    lever: Array = field(default_factory=lambda: np.zeros((6, 7)))
 
     @property
     def name(self) -> str:
@@ -182,6 +187,17 @@ class HeldObject:
         return float(np.sqrt(np.trace(turn @ self.covariance[:3, :3] @ turn.T)))
 
     @property
+    def place_spread(self) -> float:
+        """Largest standard deviation in any direction of the center of the contact face, or of a ball's center [m]."""
+        shift = self.covariance[3:, 3:] if self.body.sphere is not None else self.face_covariance
+        return float(np.sqrt(np.linalg.eigvalsh(shift)[-1]))
+
+    @property
+    def turn_spread(self) -> float:
+        """Standard deviation of the axis in each direction [rad]; 0 for a ball, whose turn does not matter."""
+        return 0.0 if self.body.sphere is not None else self.axis_spread / float(np.sqrt(2.0))
+
+    @property
     def _point(self) -> Array:
         return np.array(self.body.contact.point if self.body.contact else (0.0, 0.0, 0.0)) * self.scale
 
@@ -194,12 +210,14 @@ class _Region(NamedTuple):
         prior: Information before, shape (6, 6) or (9, 9).
         share: Independent measurements, over all points.
         pixels: Number of pixels that may be the object's.
+        outliers: Mean squared error over that of noise where half of the points are on no surface.
     """
 
     window: Window
     prior: Array
     share: float
     pixels: int
+    outliers: float
 
 
 class Expected(NamedTuple):
@@ -233,8 +251,17 @@ class HeldObjectFinder:
         settings: The settings.
     """
 
-    def __init__(self, robot: Robot, attached: Sequence[AttachedObject], settings: HeldSettings | None = None) -> None:
+    def __init__(
+        self, robot: Robot, attached: Sequence[AttachedObject], settings: HeldSettings | None = None,
+        surface: RobotSurface | None = None,
+    ) -> None:  # fmt: skip
         """Prepare the surfaces of robot and objects.
+
+        Args:
+            robot: The robot.
+            attached: The objects.
+            settings: The settings.
+            surface: The robot's surface, where it is known already.
 
         Raises:
             ApexError: An object has a link that the robot does not have, or a shape without a surface.
@@ -242,7 +269,7 @@ class HeldObjectFinder:
         self.robot, self.attached, self.settings = robot, tuple(attached), settings or HeldSettings()
         for one in self.attached:
             robot.link_frame(one.link)
-        self._robot = RobotSurface(robot)
+        self._robot = surface or RobotSurface(robot)
         self._surfaces = [body_surface(one) for one in self.attached]
         self._ties = [_ties(one, surface) for one, surface in zip(self.attached, self._surfaces, strict=True)]
         pairs = list(zip(self.attached, self._surfaces, strict=True))
@@ -328,7 +355,9 @@ class HeldObjectFinder:
                         expected, prior, settings)
             for start in self._starts(one, expected, registration)
         ]  # fmt: skip
-        return self._answer(one, fits, seen, _Region(window, prior, settings.point_share * len(kept), count))
+        outliers = 0.5 / 3.0 * (settings.last / (noise * center[2] ** 2 + s.floor)) ** 2  # by Tukey's loss
+        region = _Region(window, prior, settings.point_share * len(kept), count, float(outliers))
+        return self._answer(one, fits, seen, region)
 
     def _fit_settings(self, one: Expected, seen: CorrectedFrame, window: Window, thinning: float) -> FitSettings:
         """Return the weights of points that stand for others, of pixels that share their noise in patches."""
@@ -360,17 +389,19 @@ class HeldObjectFinder:
         if not np.isfinite(best.cost):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
         misfit = best.cost / region.share
-        if misfit > self.settings.most_misfit:
+        if misfit > max(self.settings.most_misfit, region.outliers):
             return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
         factor = max(1.0, misfit / MISFIT) ** GROWTH  # of the variances of measurements
         n = len(best.information)
         covariance: Array = np.zeros((n, n))
+        common: Array = np.zeros((n, 7))
         weights = np.exp(-0.5 * np.array([fit.cost - best.cost for fit in fits]))
         for fit, weight in zip(fits, weights / weights.sum(), strict=True):
             if weight < 1e-3:
                 continue
             own = np.linalg.inv(prior + (fit.information - prior) / factor)
             lever = own @ fit.cross / factor
+            common = common + weight * lever
             away = np.zeros(n)
             away[:3] = pin.log3(fit.rotation @ best.rotation.T)
             away[3:6] = fit.position - best.position
@@ -379,12 +410,21 @@ class HeldObjectFinder:
         pose[:3, :3], pose[:3, 3] = best.rotation, best.position
         share, missed = _measured_shares(best, seen.depth[_cells(region.window)])
         if missed > share:
-            return _without(one, f"{one.body.name!r}: no surface is seen where the hand holds it", count)
+            return _without(one, f"{one.body.name!r}: {NOT_THERE}", count)
         if share < self.settings.least_seen:
             return _without(one, f"{one.body.name!r} is hidden: {100 * share:.0f} % of it can be seen", count)
         size = np.sqrt(np.diag(covariance)[6:][one.ties]) if n > 6 else np.zeros(3)
-        world = turned(covariance[:6, :6], registration.pose[:3, :3])
-        return HeldObject(one.body, "", registration.pose @ pose, world, best.scale, size, share, count, misfit)
+        world, found = turned(covariance[:6, :6], registration.pose[:3, :3]), registration.pose @ pose
+        if _far_from(one, found):
+            return _without(one, f"{one.body.name!r}: what is seen is not where the hand holds it", count)
+        lever = np.kron(np.eye(2), registration.pose[:3, :3]) @ common[:6]
+        return HeldObject(one.body, "", found, world, best.scale, size, share, count, misfit, lever)
+
+
+def _far_from(one: Expected, pose: Array) -> bool:
+    """Whether an object is farther from its grasp than grasps vary."""
+    off = np.concatenate([pin.log3(pose[:3, :3] @ one.pose[:3, :3].T), pose[:3, 3] - one.pose[:3, 3]])
+    return float(off @ np.linalg.solve(one.covariance, off)) > FARTHEST
 
 
 def turned(covariance: Array, rotation: Array) -> Array:
@@ -442,7 +482,7 @@ def _nothing_seen(name: str, depth: Array, robot: Array, front: float) -> str:
         return f"{name!r}: {100 * np.mean(depth == 0.0):.0f} % of the image around it have no depth"
     if np.mean(depth[depth > 0.0] < front) > 0.3 or np.mean(np.isfinite(robot)) > 0.5:
         return f"{name!r} is hidden: the camera sees other surfaces before it"
-    return f"{name!r}: no surface is seen where the hand holds it"
+    return f"{name!r}: {NOT_THERE}"
 
 
 def _without(one: Expected, reason: str, count: int = 0) -> HeldObject:

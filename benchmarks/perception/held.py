@@ -214,7 +214,7 @@ def calibrate(made: Robot, n: int) -> None:
     print(table(SQUARED, covariance_rows(found)))
 
 
-def compact(found: Sequence[Sample]) -> dict[str, list[Any]]:
+def compact(found: Sequence[Any]) -> dict[str, list[Any]]:
     """Return samples for the results by their fields, numbers with four digits."""
     rows = [asdict(one) for one in found]
     return {

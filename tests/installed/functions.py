@@ -391,6 +391,9 @@ def _use_fits() -> None:
         HeldObjectFinder,
         HeldSettings,
         KnownSize,
+        LookSettings,
+        LookState,
+        ObjectView,
         ObstacleFinder,
         ObstacleSettings,
         ObstacleTracker,
@@ -398,6 +401,8 @@ def _use_fits() -> None:
         SeenTask,
         TrackedObstacle,
         TrackerSettings,
+        look_plan,
+        look_states,
         vect_align,
     )
     from apex_ompl.perception.registration import corrected
@@ -428,6 +433,12 @@ def _use_fits() -> None:
     alignment = Alignment(kind="vertical", first=attached[0].name, second=attached[1].name)
     task = vect_align(frame, robot, attached, alignment, AlignSettings(obstacles=None))
     assert isinstance(task, SeenTask) and bool(task) == (not task.reasons)
+    looks = look_states(
+        robot, attached, attached[0].name, frame.camera, frame.state(robot.joint_names),
+        settings=LookSettings(proposals=8, predicted=2, rounds=1),
+    )  # fmt: skip
+    assert all(isinstance(one, LookState) and isinstance(one.objects[0], ObjectView) for one in looks)
+    assert len(look_plan(looks)) <= 1 and all(one.names in ((), (attached[0].name,)) for one in looks)
 
 
 def _use_map(camera: Any) -> None:

@@ -8,16 +8,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import AlignmentGoal
 from apex_ompl.perception.alignment import MOVED, AlignSettings, SeenTask, vect_align
 from apex_ompl.perception.camera import look_at
 from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.looking import LookSettings
 from apex_ompl.perception.registration import RegistrationSettings, corrected
 from apex_ompl.perception.surfaces import RobotSurface
 from apex_ompl.perception.synthetic import SceneGenerator, SyntheticScene, SyntheticSettings
 from apex_ompl.problems.objects import DATA
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Alignment, Tolerance, WorldVector
 
 pytest.importorskip("cv2")
@@ -135,6 +138,57 @@ def test_a_hidden_object_is_named(scene: SyntheticScene, robot: Robot) -> None:
     depth = np.where((rows - row) ** 2 + (columns - column) ** 2 < 60.0**2, 0.4, frame.depth)
     found = task(scene, robot, replace(frame, depth=depth))
     assert any(repr(one.kind) in reason and "hidden" in reason for reason in found.reasons), found.reasons
+
+
+def without(scene: SyntheticScene, k: int, depth: float = 0.4) -> Frame:
+    """Return a frame in which something hides an object."""
+    frame, one = scene.frames[0], scene.objects[k]
+    center = np.linalg.inv(frame.camera.pose) @ one.pose[:, 3]
+    column, row = frame.camera.project(center[:3])
+    rows, columns = np.mgrid[0:480, 0:640]
+    near = (rows - row) ** 2 + (columns - column) ** 2 < 60.0**2
+    return replace(frame, depth=np.where(near, depth, frame.depth))
+
+
+def test_states_are_offered_for_what_is_hidden(scene: SyntheticScene, robot: Robot) -> None:
+    first, second = (one.reported for one in scene.objects)
+    alignment = Alignment(kind="vertical", first=first.name, second=second.name, tolerance=WIDE)
+    settings = AlignSettings(obstacles=None, look=LookSettings(proposals=30, predicted=6, rounds=1))
+    checker = CollisionChecker(robot, (), [first, second])
+    given = robot, [first, second], alignment, settings
+    found = vect_align(without(scene, 0), *given, world=checker)
+    assert not found
+    assert {view.name for look in found.looks for view in look.objects} == {first.name}
+    assert all(checker.is_free(look.state) for look in found.looks)
+    hands, reported = robot.groups["hands"], scene.frames[0].state(robot.joint_names)
+    np.testing.assert_array_equal(found.looks[0].state[hands], reported[hands])  # not as the camera corrects them
+    assert vect_align(without(scene, 0), *given).looks == ()
+    assert vect_align(scene.frames[0], *given, world=checker).looks == ()
+    eye = scene.frames[0].camera.pose
+    ball = {"name": "lid", "sphere": {"radius": 0.35}, "position": (eye[:3, 3] + 0.5 * eye[:3, 2]).tolist()}
+    lid = Obstacle.model_validate(ball)
+    shut = vect_align(without(scene, 0), *given, world=[lid])
+    assert shut.looks == ()
+    assert shut.reasons[-1] == f"no free state was found from which a camera sees {first.name!r}"
+
+
+def test_what_one_camera_does_not_see_another_one_does(scene: SyntheticScene, robot: Robot) -> None:
+    first, second = (one.reported for one in scene.objects)
+    alignment = Alignment(kind="vertical", first=first.name, second=second.name, tolerance=WIDE)
+    settings = AlignSettings(obstacles=None)
+    other = without(scene, 1)
+    other = replace(other, camera=other.camera.model_copy(update={"name": "other"}))
+    assert not vect_align(other, robot, [first, second], alignment, settings)
+    found = vect_align([without(scene, 0), other], robot, [first, second], alignment, settings)
+    assert found, found.reasons
+    for one, held in zip(scene.objects, found.held, strict=True):
+        assert np.linalg.norm(held.pose[:3, 3] - one.pose[:3, 3]) < 0.012
+    pose = other.camera.pose.copy()
+    pose[:3, 3] += 0.1
+    moved = replace(scene.frames[0], camera=other.camera.placed(pose))
+    found = vect_align([moved, scene.frames[0]], robot, [first, second], alignment, settings)
+    assert found, found.reasons
+    assert len(found.left_out) == 1 and "'other' has moved" in found.left_out[0]
 
 
 def test_two_of_a_name_and_unknown_names_are_refused(scene: SyntheticScene, robot: Robot) -> None:

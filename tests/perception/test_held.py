@@ -131,6 +131,21 @@ def test_an_empty_hand_is_no_object(generator: SceneGenerator, robot: Robot) -> 
     assert sum(bool(reason) for reason in reasons) >= 7
 
 
+def test_an_object_far_from_where_the_hand_holds_it_is_no_answer(generator: SceneGenerator, robot: Robot) -> None:
+    answers = 0
+    for seed in range(4):
+        scene = generator.draw(np.random.default_rng((5, seed)))
+        attached = []
+        for one in scene.objects:
+            x, y, z = one.reported.position
+            attached.append(one.reported.model_copy(update={"position": (x + 0.06, y, z)}))  # 7 deviations
+        found = HeldObjectFinder(robot, attached).find(scene.frames[0])
+        for one, its in zip(scene.objects, found, strict=True):
+            wrong = np.linalg.norm(its.pose[:3, 3] - one.pose[:3, 3]) > 0.01
+            answers += not its.reason and not wrong
+    assert answers == 0
+
+
 def test_a_frame_without_a_joint_and_bad_settings_are_refused(generator: SceneGenerator, robot: Robot) -> None:
     scene = generator.draw(np.random.default_rng((5, 0)))
     frame = scene.frames[0]
