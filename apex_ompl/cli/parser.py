@@ -117,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_view(commands)
     _add_convert(commands)
     _add_calibrate(commands)
+    _add_see(commands)
     _add_benchmark(commands)
     _add_check(commands)
     for name, text in (
@@ -303,6 +304,18 @@ def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints whose readings may be off")
     parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
     parser.set_defaults(run="perception:calibrate")
+
+
+def _add_see(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("see", help="find held objects and obstacles in frames of a camera")
+    parser.add_argument("frames", type=Path, metavar="FRAMES", help="a frame (.npz), or a folder of frames")
+    parser.add_argument("--problem", metavar="PROBLEM", help="whose robot holds the objects (default: none are held)")
+    parser.add_argument(
+        "--robot", default="dual_panda_softhand", help="without --problem: robot name or file (default: %(default)s)"
+    )
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="draw what was found into the picture: .png")
+    parser.add_argument("--json", action="store_true", help="print what was found, with covariances, as JSON")
+    parser.set_defaults(run="perception:see")
 
 
 def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:

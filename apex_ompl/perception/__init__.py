@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
     from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
     from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
+    from apex_ompl.perception.sight import Sight as Sight
+    from apex_ompl.perception.sight import see as see
     from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
     from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
@@ -49,6 +51,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",
+        "sight": "Sight see",
         "synchronizer": "Synchronizer",
         "twin_camera": "TwinCamera",
     },  # fmt: skip
