@@ -67,7 +67,7 @@ class SeenTask:
 
     Attributes:
         reasons: Why there is no task, as sentences; empty where there is one.
-        alignment: The alignment, of the objects of ``attached``, where there is one.
+        alignment: The alignment, of the objects of ``attached``.
         attached: The held objects as they were seen.
         vectors: Contact faces of both objects as vectors in the world; empty without a task.
         obstacles: Obstacles, larger by the margin; of boxes seen from one side it may be too small.
@@ -78,7 +78,7 @@ class SeenTask:
     """
 
     reasons: tuple[str, ...]
-    alignment: Alignment | None
+    alignment: Alignment
     attached: tuple[AttachedObject, ...]
     vectors: tuple[WorldVector, ...]
     obstacles: tuple[Obstacle, ...]
