@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from apex_ompl.perception.held import HeldObject as HeldObject
     from apex_ompl.perception.held import HeldObjectFinder as HeldObjectFinder
     from apex_ompl.perception.held import HeldSettings as HeldSettings
+    from apex_ompl.perception.looking import LookSettings as LookSettings
+    from apex_ompl.perception.looking import LookState as LookState
+    from apex_ompl.perception.looking import ObjectView as ObjectView
+    from apex_ompl.perception.looking import look_states as look_states
     from apex_ompl.perception.obstacles import ObstacleFinder as ObstacleFinder
     from apex_ompl.perception.obstacles import ObstacleSettings as ObstacleSettings
     from apex_ompl.perception.obstacles import SeenObstacle as SeenObstacle
@@ -48,6 +52,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "frames": "Frame load_frames mean_frame save_sequence",
         "hand_eye": "Calibration View calibrate",
         "held": "HeldObject HeldObjectFinder HeldSettings",
+        "looking": "LookSettings LookState ObjectView look_states",
         "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",

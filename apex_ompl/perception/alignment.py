@@ -8,24 +8,29 @@ enough for the task's tolerance there is no task, but a sentence that says why.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.perception.frames import Frame, mean_frame
+from apex_ompl.perception.frames import Frame, looks_of, mean_frame
+from apex_ompl.perception.fusion import Sighting, fused
 from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
+from apex_ompl.perception.looking import LookSettings, LookState, World, look_states
 from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle
 from apex_ompl.perception.registration import CorrectedFrame, corrected
 from apex_ompl.perception.surfaces import RobotSurface, body_surface, inverse
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
+from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Alignment, WorldVector
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_positive
 
 LENGTH = 0.05  # of vectors in the world [m]
 MOVED = 22.5  # squared error of six dimensions that a camera at its place exceeds once in 1000
+LOOKED = 0.7  # share of the largest standard deviations that a look is expected to leave
 FEWEST = 60  # pixels of the robot that tell whether the camera is at its place
 
 
@@ -40,6 +45,7 @@ class AlignSettings:
         deviations: Standard deviations of the faces that have to be within the tolerance.
         margin: Standard deviations by which obstacles grow.
         least_match: Share of the robot's visible surface that has to be where it is expected.
+        look: How states to look from are sought; their standard deviations follow from the tolerance.
     """
 
     held: HeldSettings = field(default_factory=HeldSettings)
@@ -48,6 +54,7 @@ class AlignSettings:
     deviations: float = 1.0
     margin: float = 2.0
     least_match: float = 0.8
+    look: LookSettings = field(default_factory=LookSettings)
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -75,6 +82,9 @@ class SeenTask:
         seen: All obstacles with their covariances.
         camera: Corrected pose of the optical frame in the world, shape (4, 4) [m].
         stamp: Time of the last frame [s].
+        looks: States from which what is not known well enough can be seen, the best first; empty where all is known, or
+            no world was given.
+        left_out: Why looks of cameras that cannot be trusted do not count, as sentences.
     """
 
     reasons: tuple[str, ...]
@@ -86,6 +96,8 @@ class SeenTask:
     seen: tuple[SeenObstacle, ...]
     camera: Array
     stamp: float
+    looks: tuple[LookState, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
         """Whether there is a task."""
@@ -94,44 +106,82 @@ class SeenTask:
 
 def vect_align(
     frames: Frame | Sequence[Frame], robot: Robot, attached: Sequence[AttachedObject], alignment: Alignment,
-    settings: AlignSettings | None = None,
+    settings: AlignSettings | None = None, *, world: World = None, constraints: Sequence[Constraint] = (),
 ) -> SeenTask:  # fmt: skip
-    """Return the task that frames of a camera show: faces to be aligned, held objects and obstacles.
+    """Return the task that frames show: faces to be aligned, held objects and obstacles.
+
+    Frames of a camera and a robot at rest are one look. Looks in several states and of several cameras are fused, but
+    for those whose camera cannot be trusted; all is returned where it is in the state of the last frame.
 
     Args:
-        frames: A frame, or several of a camera and a robot that stand still, with the positions of all joints.
+        frames: A frame, or several, with the positions of all joints.
         robot: The robot.
         attached: The objects that it holds, at the poses that grasps give them.
         alignment: What is to be aligned: the names of two of these objects, or of one and a hand.
         settings: The settings.
+        world: What states to look from are free of: a checker, a planner's world or obstacles. Without one no states
+            are sought.
+        constraints: What has to hold in these states.
 
     Raises:
         ApexError: A name is not that of a held object, frames do not fit together, or lack a joint.
     """
     s = settings or AlignSettings()
     shots = [frames] if isinstance(frames, Frame) else list(frames)
-    frame = mean_frame(shots)
-    names = [one.name for one in attached]
-    wanted = _wanted(alignment, names, robot)
+    wanted = _wanted(alignment, [one.name for one in attached], robot)
     surface = RobotSurface(robot)
-    given = corrected(frame, surface, s.held.registration, len(shots))
-    held = HeldObjectFinder(robot, attached, s.held).find_in(given)
-    reasons = [*_camera_reasons(given, frame, robot, s)]
-    reasons += [one.reason for one in held if one.reason and one.name in wanted]
+    finder = HeldObjectFinder(robot, attached, s.held, surface)
+    looks = [_look(own, finder, surface, s) for own in looks_of(shots)]
+    trusted = [look for look in looks if not look.reasons]
+    untrusted = tuple(reason for look in looks for reason in look.reasons)
+    now, used = looks[-1].seen.registration, trusted or looks
+    links = [robot.link_pose(now.state, one.link) for one in attached]
+    held = tuple(
+        fused([Sighting(look.held[k], robot.link_pose(look.seen.registration.state, one.link), look.seen)
+               for look in used], links[k], s.held)
+        for k, one in enumerate(attached)
+    )  # fmt: skip
     chosen = [one for one in held if one.name in wanted]
-    if not reasons:
-        reasons += _tolerance_reasons(chosen, alignment, s)
+    unknown = {one.name: why for one in chosen if (why := one.reason or _tolerance_reason(one, chosen, alignment, s))}
+    reasons = [*unknown.values()] if trusted else [*untrusted, *(one.reason for one in chosen if one.reason)]
     found: tuple[SeenObstacle, ...] = ()
     if s.obstacles is not None:
-        found, missing = _obstacles(given, frame, held, s)
+        found, missing = _obstacles(used, s)
         reasons += missing
-    links = {one.name: robot.link_pose(given.registration.state, one.link) for one in attached}
+    seen = tuple(_as_seen(one, link) for one, link in zip(held, links, strict=True))
+    states: tuple[LookState, ...] = ()
+    if world is not None and trusted and unknown:
+        limits = _limits(alignment, len(chosen), s)
+        states = look_states(
+            robot, seen, list(unknown), list({look.frame.camera.name: look.frame.camera for look in trusted}.values()),
+            now.state, world=world, held=s.held, constraints=constraints, surface=surface,
+            settings=replace(s.look, place=LOOKED * limits[0], turn=LOOKED * limits[1], seed=s.look.seed + len(looks)),
+            avoided=[look.seen.registration.state for look in looks],
+        )  # fmt: skip
     vectors = tuple(_vector(one) for one in chosen) if not reasons else ()
+    obstacles = tuple(one.obstacle(f"seen_{k + 1}", s.margin) for k, one in enumerate(found))
     return SeenTask(
-        tuple(reasons), alignment, tuple(_as_seen(one, links[one.name]) for one in held), vectors,
-        tuple(one.obstacle(f"seen_{k + 1}", s.margin) for k, one in enumerate(found)), held, found,
-        given.registration.pose, frame.stamp,
+        tuple(reasons), alignment, seen, vectors, obstacles, held, found, now.pose, shots[-1].stamp, states,
+        untrusted if trusted else (),
     )  # fmt: skip
+
+
+class _Look(NamedTuple):
+    """A look: the mean of its frames, its corrected depths, what it found, and why its camera cannot be trusted."""
+
+    frame: Frame
+    seen: CorrectedFrame
+    held: tuple[HeldObject, ...]
+    reasons: tuple[str, ...]
+
+
+def _look(
+    frames: Sequence[Frame], finder: HeldObjectFinder, surface: RobotSurface, settings: AlignSettings
+) -> _Look:  # fmt: skip
+    """Return the look that frames of a camera and a robot at rest are."""
+    frame = mean_frame(frames)
+    seen = corrected(frame, surface, settings.held.registration, len(frames))
+    return _Look(frame, seen, finder.find_in(seen), tuple(_camera_reasons(seen, frame, finder.robot, settings)))
 
 
 def _wanted(alignment: Alignment, names: Sequence[str], robot: Robot) -> set[str]:
@@ -182,38 +232,55 @@ def _camera_reasons(given: CorrectedFrame, frame: Frame, robot: Robot, settings:
     ]
 
 
-def _tolerance_reasons(chosen: Sequence[HeldObject], alignment: Alignment, settings: AlignSettings) -> list[str]:
-    """Return which objects are not known well enough for the tolerance."""
+def _limits(alignment: Alignment, count: int, settings: AlignSettings) -> tuple[float, float]:
+    """Return the largest standard deviations of a face [m] and an axis [rad], of a number of faces."""
     tolerance = alignment.tolerance or ALIGNMENT_DEFAULTS[alignment.kind][1]
-    share, length = settings.deviations * np.sqrt(len(chosen)), min(tolerance.lateral, tolerance.axial)
-    reasons = []
-    for one in chosen:
-        place = float(np.sqrt(np.linalg.eigvalsh(one.face_covariance)[-1]))
-        place, turn = share * place, share * one.axis_spread / np.sqrt(2.0)
-        if place > length or (one.body.sphere is None and turn > tolerance.angle):
-            reasons.append(
-                f"{one.name!r} is known to {1e3 * place:.1f} mm and {np.degrees(turn):.1f} degrees only, the tolerance "
-                f"is {1e3 * length:.1f} mm and {np.degrees(tolerance.angle):.1f} degrees"
-            )
-    return reasons
+    share = settings.deviations * float(np.sqrt(count))
+    return min(tolerance.lateral, tolerance.axial) / share, tolerance.angle / share
 
 
-def _obstacles(
-    given: CorrectedFrame, frame: Frame, held: Sequence[HeldObject], settings: AlignSettings
-) -> tuple[tuple[SeenObstacle, ...], list[str]]:
-    """Return the obstacles seen, and why they are not all."""
-    name = frame.camera.name
-    if frame.color is None:
-        return (), [f"{name!r} gave no colors, without which no obstacle is found"]
-    balls = [(one.pose[:3, 3], _radius(one)) for one in held]
-    found = ObstacleFinder(settings.obstacles).find(given, frame.color, balls)
-    reasons = []
+def _tolerance_reason(
+    one: HeldObject, chosen: Sequence[HeldObject], alignment: Alignment, settings: AlignSettings
+) -> str:  # fmt: skip
+    """Return why an object is not known well enough for the tolerance, or an empty text."""
+    place, turn = _limits(alignment, len(chosen), settings)
+    if one.place_spread <= place and one.turn_spread <= turn:
+        return ""
+    share = settings.deviations * float(np.sqrt(len(chosen)))
+    return (
+        f"{one.name!r} is known to {1e3 * share * one.place_spread:.1f} mm and "
+        f"{np.degrees(share * one.turn_spread):.1f} degrees only, the tolerance is {1e3 * share * place:.1f} mm and "
+        f"{np.degrees(share * turn):.1f} degrees"
+    )
+
+
+def _obstacles(looks: Sequence[_Look], settings: AlignSettings) -> tuple[tuple[SeenObstacle, ...], list[str]]:
+    """Return the obstacles of all looks, and why they are not all."""
+    colored = [look for look in looks if look.frame.color is not None]
+    if not colored:
+        return (), [f"{looks[-1].frame.camera.name!r} gave no colors, without which no obstacle is found"]
+    finder, found, reasons = ObstacleFinder(settings.obstacles), list[SeenObstacle](), []
+    for look in colored:
+        balls = [(one.pose[:3, 3], _radius(one)) for one in look.held]
+        assert look.frame.color is not None
+        for new in finder.find(look.seen, look.frame.color, balls):
+            known = next((k for k, one in enumerate(found) if _same(one, new)), None)
+            if known is None:
+                found.append(new)
+            elif (new.cut, new.place_spread) < (found[known].cut, found[known].place_spread):
+                found[known] = new
     if len(found) > settings.most_obstacles:
         reasons.append(f"{len(found)} obstacles of the color are seen, at most {settings.most_obstacles} are expected")
     cut = sum(one.cut for one in found)
     if cut:
-        reasons.append(f"the image of {name!r} cuts {cut} of {len(found)} obstacles")
-    return found, reasons
+        reasons.append(f"the image of {colored[-1].frame.camera.name!r} cuts {cut} of {len(found)} obstacles")
+    return tuple(found), reasons
+
+
+def _same(first: SeenObstacle, second: SeenObstacle) -> bool:
+    """Whether obstacles of two looks are one: their centers are nearer than half of their sizes."""
+    apart = float(np.linalg.norm(first.pose[:3, 3] - second.pose[:3, 3]))
+    return apart < 0.5 * min(float(np.max(first.size)), float(np.max(second.size)))
 
 
 def _radius(one: HeldObject) -> float:

@@ -179,6 +179,32 @@ def load_frames(path: str | Path) -> list[Frame]:
     return frames
 
 
+def looks_of(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """Return frames by look: those of a camera at one place, with a robot at rest in one state; the last look last.
+
+    Raises:
+        ParameterError: There is no frame, something else is among them, or they have different joints.
+    """
+    if not frames:
+        raise ParameterError("frames", 0, "one frame or more")
+    looks: list[list[Frame]] = []
+    for frame in frames:
+        if not isinstance(frame, Frame):
+            raise ParameterError("frames", frame, "frames")
+        if frame.joints.keys() != frames[0].joints.keys():
+            raise ParameterError("frames", sorted(frame.joints), "the same joints in all frames")
+        own = next((look for look in looks if look[0].camera == frame.camera and _moved(look[0], frame) <= STILL), None)
+        if own is not None:
+            looks.remove(own)
+        looks.append([*(own or ()), frame])
+    return looks
+
+
+def _moved(first: Frame, second: Frame) -> float:
+    """Return the largest difference of a joint of two frames."""
+    return max((abs(first.joints[name] - value) for name, value in second.joints.items()), default=0.0)
+
+
 def mean_frame(frames: Sequence[Frame]) -> Frame:
     """Return the last of some frames with the mean depths of all.
 
@@ -196,7 +222,7 @@ def mean_frame(frames: Sequence[Frame]) -> Frame:
             raise ParameterError("frames", frame.camera.name, f"frames of {last.camera.name!r} at one place")
         if frame.joints.keys() != last.joints.keys():
             raise ParameterError("frames", sorted(frame.joints), "the same joints in all frames")
-        moved = max((abs(frame.joints[name] - value) for name, value in last.joints.items()), default=0.0)
+        moved = _moved(frame, last)
         if moved > STILL:
             raise ParameterError("frames", f"a joint that moved by {moved:.3g}", "frames of a robot that stands still")
     if len(frames) == 1:

@@ -50,6 +50,7 @@ ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in whi
 MISFIT = 2.5  # mean squared error of points over that of noise above which covariances grow
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
+NOT_THERE = "no surface is seen where the hand holds it"
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
 
 
@@ -131,6 +132,8 @@ class HeldObject:
         seen: Share of the object's outline that was measured.
         points: Number of pixels that may be the object's.
         misfit: Mean robust squared error of its points over what noise explains; infinite without an answer.
+        lever: Derivatives of its turn and shift by the remaining turn, shift and scale of the camera, the former in the
+            axes of the world, the latter in those of the optical frame, shape (6, 7); zeros without an answer.
     """
 
     body: AttachedObject
@@ -142,6 +145,7 @@ class HeldObject:
     seen: float = 0.0
     points: int = 0
     misfit: float = np.inf
+    lever: Array = field(default_factory=lambda: np.zeros((6, 7)))
 
     @property
     def name(self) -> str:
@@ -177,6 +181,17 @@ class HeldObject:
         """Standard deviation of the axis, root of the sum over both directions [rad]."""
         turn = pin.skew(self.axis)
         return float(np.sqrt(np.trace(turn @ self.covariance[:3, :3] @ turn.T)))
+
+    @property
+    def place_spread(self) -> float:
+        """Largest standard deviation in any direction of the center of the contact face, or of a ball's center [m]."""
+        shift = self.covariance[3:, 3:] if self.body.sphere is not None else self.face_covariance
+        return float(np.sqrt(np.linalg.eigvalsh(shift)[-1]))
+
+    @property
+    def turn_spread(self) -> float:
+        """Standard deviation of the axis in each direction [rad]; 0 for a ball, whose turn does not matter."""
+        return 0.0 if self.body.sphere is not None else self.axis_spread / float(np.sqrt(2.0))
 
     @property
     def _point(self) -> Array:
@@ -230,8 +245,17 @@ class HeldObjectFinder:
         settings: The settings.
     """
 
-    def __init__(self, robot: Robot, attached: Sequence[AttachedObject], settings: HeldSettings | None = None) -> None:
+    def __init__(
+        self, robot: Robot, attached: Sequence[AttachedObject], settings: HeldSettings | None = None,
+        surface: RobotSurface | None = None,
+    ) -> None:  # fmt: skip
         """Prepare the surfaces of robot and objects.
+
+        Args:
+            robot: The robot.
+            attached: The objects.
+            settings: The settings.
+            surface: The robot's surface, where it is known already.
 
         Raises:
             ApexError: An object has a link that the robot does not have, or a shape without a surface.
@@ -239,7 +263,7 @@ class HeldObjectFinder:
         self.robot, self.attached, self.settings = robot, tuple(attached), settings or HeldSettings()
         for one in self.attached:
             robot.link_frame(one.link)
-        self._robot = RobotSurface(robot)
+        self._robot = surface or RobotSurface(robot)
         self._surfaces = [body_surface(one) for one in self.attached]
         self._ties = [_ties(one, surface) for one, surface in zip(self.attached, self._surfaces, strict=True)]
         pairs = list(zip(self.attached, self._surfaces, strict=True))
@@ -362,12 +386,14 @@ class HeldObjectFinder:
         factor = max(1.0, misfit / MISFIT) ** 2  # of the variances of measurements
         n = len(best.information)
         covariance: Array = np.zeros((n, n))
+        common: Array = np.zeros((n, 7))
         weights = np.exp(-0.5 * np.array([fit.cost - best.cost for fit in fits]))
         for fit, weight in zip(fits, weights / weights.sum(), strict=True):
             if weight < 1e-3:
                 continue
             own = np.linalg.inv(prior + (fit.information - prior) / factor)
             lever = own @ fit.cross / factor
+            common = common + weight * lever
             away = np.zeros(n)
             away[:3] = pin.log3(fit.rotation @ best.rotation.T)
             away[3:6] = fit.position - best.position
@@ -376,12 +402,13 @@ class HeldObjectFinder:
         pose[:3, :3], pose[:3, 3] = best.rotation, best.position
         share, missed = _measured_shares(best, seen.depth[_cells(region.window)])
         if missed > share:
-            return _without(one, f"{one.body.name!r}: no surface is seen where the hand holds it", count)
+            return _without(one, f"{one.body.name!r}: {NOT_THERE}", count)
         if share < self.settings.least_seen:
             return _without(one, f"{one.body.name!r} is hidden: {100 * share:.0f} % of it can be seen", count)
         size = np.sqrt(np.diag(covariance)[6:][one.ties]) if n > 6 else np.zeros(3)
         world = turned(covariance[:6, :6], registration.pose[:3, :3])
-        return HeldObject(one.body, "", registration.pose @ pose, world, best.scale, size, share, count, misfit)
+        lever = np.kron(np.eye(2), registration.pose[:3, :3]) @ common[:6]
+        return HeldObject(one.body, "", registration.pose @ pose, world, best.scale, size, share, count, misfit, lever)
 
 
 def turned(covariance: Array, rotation: Array) -> Array:
@@ -439,7 +466,7 @@ def _nothing_seen(name: str, depth: Array, robot: Array, front: float) -> str:
         return f"{name!r}: {100 * np.mean(depth == 0.0):.0f} % of the image around it have no depth"
     if np.mean(depth[depth > 0.0] < front) > 0.3 or np.mean(np.isfinite(robot)) > 0.5:
         return f"{name!r} is hidden: the camera sees other surfaces before it"
-    return f"{name!r}: no surface is seen where the hand holds it"
+    return f"{name!r}: {NOT_THERE}"
 
 
 def _without(one: Expected, reason: str, count: int = 0) -> HeldObject:
