@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from apex_ompl.perception.sight import Sight as Sight
     from apex_ompl.perception.sight import see as see
     from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
+    from apex_ompl.perception.tracking import ObstacleTracker as ObstacleTracker
+    from apex_ompl.perception.tracking import TrackedObstacle as TrackedObstacle
+    from apex_ompl.perception.tracking import TrackerSettings as TrackerSettings
     from apex_ompl.perception.twin_camera import TwinCamera as TwinCamera
 
 __all__, __getattr__, __dir__ = lazy_names(
@@ -58,6 +61,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "ros2_camera": "Ros2Camera",
         "sight": "Sight see",
         "synchronizer": "Synchronizer",
+        "tracking": "ObstacleTracker TrackedObstacle TrackerSettings",
         "twin_camera": "TwinCamera",
     },  # fmt: skip
 )

@@ -25,3 +25,13 @@ def least_squares() -> Callable[..., Any]:
     """
     found: Callable[..., Any] = import_extra("scipy.optimize", "least squares", "perception").least_squares
     return found
+
+
+def assignment() -> Callable[..., Any]:
+    """Return ``scipy.optimize.linear_sum_assignment``.
+
+    Raises:
+        MissingFileError: The extra ``perception`` is not installed.
+    """
+    found: Callable[..., Any] = import_extra("scipy.optimize", "assignment", "perception").linear_sum_assignment
+    return found

@@ -132,20 +132,46 @@ class SeenObstacle:
         return float(np.sqrt(np.trace(self.covariance[3:6, 3:6])))
 
     def obstacle(self, name: str, deviations: float = 0.0) -> Obstacle:
-        """Return the obstacle of a scene, with lengths larger by some standard deviations of their ends on both sides.
+        """Return the obstacle of a scene, larger by some standard deviations of each of its ends.
 
         Args:
             name: Its name.
             deviations: Number of standard deviations.
         """
-        own = self.pose[:3, :3].T @ self.covariance[3:6, 3:6] @ self.pose[:3, :3]
-        ends = np.sqrt(np.diag(own) + np.diag(self.covariance[6:, 6:]) / 4.0)
-        x, y, z = (self.size + 2.0 * deviations * ends).tolist()
-        if self.kind == "box":
-            shape: dict[str, object] = {"box": (x, y, z)}
-        else:
-            shape = {"cylinder": {"radius": max(x, y) / 2.0, "length": z}}
-        return Obstacle.model_validate({"name": name, **shape, **pose_fields(self.pose)})
+        return solid_obstacle(name, self.kind, self.pose, self.size, self.covariance, deviations=deviations)
+
+
+def solid_obstacle(
+    name: str, kind: Kind, pose: Array, size: Array, covariance: Array, *, deviations: float = 0.0
+) -> Obstacle:  # fmt: skip
+    """Return the obstacle of a scene, larger by some standard deviations of each of its ends.
+
+    The ends along an axis are c - s / 2 and c + s / 2 for a center c and a length s, whose errors may be correlated:
+    the front of an obstacle is known better than its back. Turns move its corners, at most as far as those reach.
+
+    Args:
+        name: Its name.
+        kind: Its kind.
+        pose: Pose in the world, shape (4, 4) [m].
+        size: Lengths along its axes, shape (3,) [m].
+        covariance: Of turn, shift and lengths as in :class:`SeenObstacle`, shape (9, 9).
+        deviations: Number of standard deviations.
+    """
+    rotation, half = pose[:3, :3], size / 2.0
+    shift = np.diag(rotation.T @ covariance[3:6, 3:6] @ rotation) + np.diag(covariance[6:, 6:]) / 4.0
+    both = np.diag(rotation.T @ covariance[3:6, 6:])
+    turns = np.diag(rotation.T @ covariance[:3, :3] @ rotation) * (1.0, 1.0, 0.0 if kind == "cylinder" else 1.0)
+    tilt = turns[[1, 2, 0]] * half[[2, 0, 1]] ** 2 + turns[[2, 0, 1]] * half[[1, 2, 0]] ** 2
+    tilt = np.minimum(deviations * np.sqrt(tilt), np.linalg.norm(half) - half)
+    low, high = (deviations * np.sqrt(np.maximum(shift + side * both, 0.0)) + tilt for side in (-1.0, 1.0))
+    placed, (x, y, z) = pose.copy(), size + low + high
+    placed[:3, 3] += rotation @ (high - low) / 2.0
+    shape: dict[str, object] = {"box": (float(x), float(y), float(z))}
+    if kind == "cylinder":
+        radius = float(max(half[0] + max(low[0], high[0]), half[1] + max(low[1], high[1])))
+        placed[:3, 3] = pose[:3, 3] + rotation[:, 2] * (high[2] - low[2]) / 2.0
+        shape = {"cylinder": {"radius": radius, "length": float(z)}}
+    return Obstacle.model_validate({"name": name, **shape, **pose_fields(placed)})
 
 
 class _Start(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+from dataclasses import replace
 
 import coal
 import numpy as np
@@ -103,17 +104,39 @@ def test_what_the_image_cuts_and_what_is_too_large_or_elsewhere() -> None:
     assert found_in([]) == ()
 
 
-def test_an_obstacle_s_margins_are_its_deviations() -> None:
-    solid, pose, _ = CASES["cube"]
+def test_an_obstacle_grows_by_the_deviations_of_its_ends() -> None:
+    solid, pose, _ = CASES["lying box"]
     (found,) = found_in([solid_part(solid, pose, 5, RED)])
-    exact, wide = found.obstacle("red"), found.obstacle("red", 2.0)
-    assert exact.box is not None
+    assert found.obstacle("red").box == pytest.approx(tuple(found.size))
+    np.testing.assert_allclose(found.obstacle("red").pose, found.pose, atol=1e-9)
+    known = found.covariance.copy()
+    known[:3] = known[:, :3] = 0.0  # without turns, whose effect is bounded only
+    still = replace(found, covariance=known)
+    rotation, zero, unit = found.pose[:3, :3], np.zeros((3, 3)), np.eye(3) / 2.0
+    ends = np.block([[zero, rotation.T, -unit], [zero, rotation.T, unit]])
+    deviations = np.sqrt(np.diag(ends @ known @ ends.T))
+    wide = still.obstacle("red", 2.0)
     assert wide.box is not None
-    np.testing.assert_allclose(exact.box, found.size)
-    own = found.pose[:3, :3].T @ found.covariance[3:6, 3:6] @ found.pose[:3, :3]
-    ends = np.sqrt(np.diag(own) + np.diag(found.covariance[6:, 6:]) / 4.0)
-    np.testing.assert_allclose(np.array(wide.box) - exact.box, 4.0 * ends)
-    np.testing.assert_allclose(exact.pose, found.pose, atol=1e-9)
+    own = (wide.pose[:3, 3] - found.pose[:3, 3]) @ rotation
+    np.testing.assert_allclose((found.size - wide.box) / 2.0 + own, -2.0 * deviations[:3], atol=1e-9)
+    np.testing.assert_allclose((wide.box - found.size) / 2.0 + own, 2.0 * deviations[3:], atol=1e-9)
+    turned = found.obstacle("red", 2.0).box
+    assert turned is not None
+    assert (np.array(turned) >= wide.box).all()
+
+
+def test_growth_holds_turned_solids_and_is_bounded() -> None:
+    pose, size = placed(0.3, 0.1, 0.3, (0.6, 0.3, 0.2)), np.array([0.1, 0.25, 0.15])
+    for angle in (0.02, 0.1, 2.0):
+        covariance = np.zeros((9, 9))
+        covariance[:3, :3] = angle**2 * np.eye(3)
+        wide = SeenObstacle("box", pose, size, covariance, False, 100).obstacle("red", 1.0)
+        corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * size
+        assert wide.box is not None
+        assert max(wide.box) <= np.linalg.norm(size) + 1e-9
+        for axis in np.eye(3):
+            turned = corners @ np.asarray(pin.exp3(angle * axis)).T
+            assert (np.abs(turned) <= np.array(wide.box) / 2.0 + angle**2 * 0.1).all()
 
 
 def test_hues_are_those_of_colorsys() -> None:
