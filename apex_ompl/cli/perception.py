@@ -75,7 +75,8 @@ def see(parsed: argparse.Namespace) -> int:
     problem = None if parsed.problem is None else load_problem(parsed.problem)
     robot = load_robot(parsed.robot if problem is None else problem.robot)
     attached, alignment = ((), None) if problem is None else (problem.attached, problem.goal.alignment)
-    found = see_frames(load_frames(parsed.frames), robot, attached, alignment)
+    frames = [frame for source in parsed.frames for frame in load_frames(source)]
+    found = see_frames(frames, robot, attached, alignment)
     if parsed.out is not None:
         write_atomically(parsed.out, png_of(picture_of(found)))
     if parsed.json:
@@ -87,14 +88,16 @@ def see(parsed: argparse.Namespace) -> int:
 
 def _print_sight(found: Sight) -> None:
     """Print what was seen, a line each."""
-    frame = found.frame
-    print(f"{frame.camera.name}: {counted(found.count, 'frame')} up to {frame.stamp:.3f} s")
-    for one in found.held:
+    for frame, count in zip(found.frames, found.counts, strict=True):
+        print(f"{frame.camera.name}: {counted(count, 'frame')} up to {frame.stamp:.3f} s")
+    for one in found.task.held:
         print(f"  object    {_held_line(one)}")
-    for seen in found.seen:
+    for seen in found.task.seen:
         print(f"  obstacle  {_obstacle_line(seen)}")
     for reason in found.reasons:
         print(f"  reason    {reason}")
+    for reason in found.task.left_out:
+        print(f"  left out  {reason}")
 
 
 def _held_line(one: HeldObject) -> str:

@@ -74,7 +74,7 @@ class SeenTask:
 
     Attributes:
         reasons: Why there is no task, as sentences; empty where there is one.
-        alignment: The alignment, of the objects of ``attached``.
+        alignment: The alignment, of the objects of ``attached``, where there is one.
         attached: The held objects as they were seen.
         vectors: Contact faces of both objects as vectors in the world; empty without a task.
         obstacles: Obstacles, larger by the margin; of boxes seen from one side it may be too small.
@@ -88,7 +88,7 @@ class SeenTask:
     """
 
     reasons: tuple[str, ...]
-    alignment: Alignment
+    alignment: Alignment | None
     attached: tuple[AttachedObject, ...]
     vectors: tuple[WorldVector, ...]
     obstacles: tuple[Obstacle, ...]
@@ -105,7 +105,7 @@ class SeenTask:
 
 
 def vect_align(
-    frames: Frame | Sequence[Frame], robot: Robot, attached: Sequence[AttachedObject], alignment: Alignment,
+    frames: Frame | Sequence[Frame], robot: Robot, attached: Sequence[AttachedObject], alignment: Alignment | None,
     settings: AlignSettings | None = None, *, world: World = None, constraints: Sequence[Constraint] = (),
 ) -> SeenTask:  # fmt: skip
     """Return the task that frames show: faces to be aligned, held objects and obstacles.
@@ -117,7 +117,8 @@ def vect_align(
         frames: A frame, or several, with the positions of all joints.
         robot: The robot.
         attached: The objects that it holds, at the poses that grasps give them.
-        alignment: What is to be aligned: the names of two of these objects, or of one and a hand.
+        alignment: What is to be aligned: the names of two of these objects, or of one and a hand. Without one all
+            objects have to be found.
         settings: The settings.
         world: What states to look from are free of: a checker, a planner's world or obstacles. Without one no states
             are sought.
@@ -128,7 +129,8 @@ def vect_align(
     """
     s = settings or AlignSettings()
     shots = [frames] if isinstance(frames, Frame) else list(frames)
-    wanted = _wanted(alignment, [one.name for one in attached], robot)
+    names = [one.name for one in attached]
+    wanted = {*names} if alignment is None else _wanted(alignment, names, robot)
     surface = RobotSurface(robot)
     finder = HeldObjectFinder(robot, attached, s.held, surface)
     looks = [_look(own, finder, surface, s) for own in looks_of(shots)]
@@ -151,7 +153,7 @@ def vect_align(
     seen = tuple(_as_seen(one, link) for one, link in zip(held, links, strict=True))
     states: tuple[LookState, ...] = ()
     if world is not None and trusted and unknown:
-        limits = _limits(alignment, len(chosen), s)
+        limits = (s.look.place, s.look.turn) if alignment is None else _limits(alignment, len(chosen), s)
         states = look_states(
             robot, seen, list(unknown), list({look.frame.camera.name: look.frame.camera for look in trusted}.values()),
             now.state, world=world, held=s.held, constraints=constraints, surface=surface,
@@ -240,9 +242,11 @@ def _limits(alignment: Alignment, count: int, settings: AlignSettings) -> tuple[
 
 
 def _tolerance_reason(
-    one: HeldObject, chosen: Sequence[HeldObject], alignment: Alignment, settings: AlignSettings
+    one: HeldObject, chosen: Sequence[HeldObject], alignment: Alignment | None, settings: AlignSettings
 ) -> str:  # fmt: skip
     """Return why an object is not known well enough for the tolerance, or an empty text."""
+    if alignment is None:
+        return ""
     place, turn = _limits(alignment, len(chosen), settings)
     if one.place_spread <= place and one.turn_spread <= turn:
         return ""

@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel.perception import draw_triangles
+from apex_ompl.perception.alignment import SeenTask
 from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.library import opencv
+from apex_ompl.perception.obstacles import SeenObstacle
 from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.sight import Sight
 from apex_ompl.perception.surfaces import Surface, body_surface, inverse
@@ -22,7 +25,7 @@ DEVIATIONS = 2.0  # of the outline of an obstacle's margin
 
 
 def picture_of(sight: Sight) -> NDArray[np.uint8]:
-    """Return the color image, or depths in gray, with what was found, shape (height, width, 3).
+    """Return the color images, or depths in gray, side by side with what was found, shape (height, width, 3).
 
     Objects that were not found are drawn in orange where their grasps have them. The outer outline of an obstacle has
     lengths larger by two standard deviations.
@@ -30,29 +33,39 @@ def picture_of(sight: Sight) -> NDArray[np.uint8]:
     Raises:
         MissingFileError: The extra ``perception`` is not installed.
     """
-    cv, frame = opencv(), sight.frame
+    images = [_drawn(sight.task, frame, pose) for frame, pose in zip(sight.frames, sight.cameras, strict=True)]
+    height = max(len(image) for image in images)
+    padded = [np.pad(image, ((0, height - len(image)), (0, 0), (0, 0))) for image in images]
+    return np.concatenate(padded, axis=1)
+
+
+def _drawn(task: SeenTask, frame: Frame, pose: Array) -> NDArray[np.uint8]:
+    """Return the image of a frame whose optical frame has a pose, shape (4, 4) [m], with what was found."""
+    cv, to_camera = opencv(), inverse(pose)
     if frame.color is not None:
         image = np.array(frame.color)
     else:
         gray = np.where(frame.depth > 0.0, 255.0 * (1.0 - frame.depth / FARTHEST).clip(0.0, 1.0), 0.0)
         image = np.repeat(gray.astype(np.uint8)[..., None], 3, axis=2)
-    to_camera = inverse(sight.camera)
-    for seen in sight.seen:
-        grown = body_surface(seen.obstacle("margin", DEVIATIONS)).at(to_camera @ seen.pose)
-        _outline(cv, image, grown, frame.camera, MARGIN)
-        exact = body_surface(seen.obstacle("seen")).at(to_camera @ seen.pose)
-        text = f"{seen.kind} {'x'.join(f'{100.0 * v:.0f}' for v in seen.size)} cm"
-        _write(cv, image, _outline(cv, image, exact, frame.camera, OBSTACLE), text, OBSTACLE)
-    for held in sight.held:
+    for seen in task.seen:
+        _outline(cv, image, _surface(seen, to_camera, DEVIATIONS), frame.camera, MARGIN)
+        corner = _outline(cv, image, _surface(seen, to_camera, 0.0), frame.camera, OBSTACLE)
+        _write(cv, image, corner, f"{seen.kind} {'x'.join(f'{100.0 * v:.0f}' for v in seen.size)} cm", OBSTACLE)
+    for held in task.held:
         color = UNSURE if held.reason else OBJECT
         surface = body_surface(held.body)
         scaled = Surface(surface.vertices * held.scale, surface.faces).at(to_camera @ held.pose)
-        corner = _outline(cv, image, scaled, frame.camera, color)
-        _write(cv, image, corner, held.name, color)
+        _write(cv, image, _outline(cv, image, scaled, frame.camera, color), held.name, color)
         if held.body.contact is not None:
             ends = np.stack([held.face, held.face + ARROW * held.axis])
             _arrow(cv, image, ends @ to_camera[:3, :3].T + to_camera[:3, 3], frame.camera, color)
     return image
+
+
+def _surface(seen: SeenObstacle, to_camera: Array, deviations: float) -> Surface:
+    """Return the surface of an obstacle in the optical frame, larger by a number of standard deviations."""
+    grown = seen.obstacle("seen", deviations)
+    return body_surface(grown).at(to_camera @ grown.pose)
 
 
 def _outline(

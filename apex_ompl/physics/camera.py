@@ -18,12 +18,11 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.drivers.grasps import in_link
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import ParameterError
-from apex_ompl.perception.alignment import AlignSettings, SeenTask
+from apex_ompl.perception.alignment import AlignSettings, SeenTask, vect_align
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.obstacles import ObstacleSettings
 from apex_ompl.perception.rig import check_cameras, default_cameras, misplaced, noisy, repeated
-from apex_ompl.perception.sight import align_together
 from apex_ompl.perception.twin_camera import TwinCamera
 from apex_ompl.physics.execution import Executor
 from apex_ompl.physics.judges import Check
@@ -32,12 +31,14 @@ from apex_ompl.physics.runner import TIMEOUT, TaskRunner, unplanned
 from apex_ompl.physics.trials import Spread, Trial, draw
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
-from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer, check_number
 
 FURNITURE = (0.79, 0.65, 0.49, 1.0)  # color of what is known
 RED = (0.8, 0.1, 0.08, 1.0)  # of obstacles that are seen
+DEVIATIONS = 2.0  # of faces that have to be within the tolerance
+LOOKS = 3  # from other states, at most
 FRAMES, PERIOD = 9, 0.1  # of a look, and time between two of them [s]
 CUBE = 0.06, 0.14  # edges of drawn cubes [m]
 LOW, HIGH = (0.25, -0.4, 0.12), (0.75, 0.4, 0.8)  # corners of the space of their centers [m]
@@ -107,7 +108,7 @@ class CameraRunner:
     cubes: int = 0
     spread: Spread = field(default_factory=lambda: Spread(place=0.0))
     grasps: GraspSpread = field(default_factory=GraspSpread)
-    settings: AlignSettings = field(default_factory=AlignSettings)
+    settings: AlignSettings = field(default_factory=lambda: AlignSettings(deviations=DEVIATIONS))
     frames: int = FRAMES
     timeout: float = TIMEOUT
     friction: Collection[str] | None = None
@@ -165,8 +166,8 @@ class CameraRunner:
             known, place = told_problem(executor.driver, trial, scene.hidden), self.runner.spread.place
             found: dict[str, float] = {}
         else:
-            executor.wait((self.frames - 1) * PERIOD)
-            task = self.look(executor.driver, trial.known, seed or 0)
+            task, trial = self.look(executor, trial, seed or 0)
+            executor.trial = trial
             if not task:
                 return unplanned(self.problem, seed, "; ".join(task.reasons), UNSEEN), executor.frames
             found = errors_of(executor.driver, task, scene.hidden)
@@ -196,26 +197,53 @@ class CameraRunner:
         true = trial.real.model_copy(update={"scene": (*trial.real.scene, *cubes), "attached": tuple(real)})
         return Scene(replace(trial, known=known, real=true), (*self.hidden, *cubes))
 
-    def look(self, driver: MujocoDriver, known: Problem, seed: int) -> SeenTask:
-        """Return what cameras see whose poses and depths are off by their spreads.
+    def look(self, executor: Executor, trial: Trial, seed: int) -> tuple[SeenTask, Trial]:
+        """Return what cameras see, and the trial whose start is the state from which the robot looked last.
+
+        Where something is not known well enough, the robot moves to states from which cameras see it, while there are
+        any, and looks again: ``LOOKS`` times at most.
 
         Args:
-            driver: The robot, at rest.
-            known: The problem as it is known before.
-            seed: Seed of the errors.
+            executor: The robot, at rest.
+            trial: The start.
+            seed: Seed of the errors of cameras and of plans.
         """
-        views = []
-        for k, camera in enumerate(self.cameras):
-            rng = np.random.default_rng((seed, 2 + k))
-            true = misplaced(camera, rng)
-            views.append(self._frames(TwinCamera(driver, true, reported=camera), rng))
-        return align_together(views, self.robot, known.attached, known.goal.alignment, self.settings)
-
-    def _frames(self, eye: TwinCamera, rng: np.random.Generator) -> list[Frame]:
+        rngs = [np.random.default_rng((seed, 2 + k)) for k in range(len(self.cameras))]
+        true = [misplaced(camera, rng) for camera, rng in zip(self.cameras, rngs, strict=True)]
+        eyes = [TwinCamera(executor.driver, a, reported=b) for a, b in zip(true, self.cameras, strict=True)]
+        frames: list[Frame] = []
         try:
-            return repeated(eye.frame(), self.frames, noisy(eye.camera, rng), PERIOD)
+            for count in range(1 + LOOKS):
+                executor.wait((self.frames - 1) * PERIOD)
+                for eye, rng in zip(eyes, rngs, strict=True):
+                    frames += repeated(eye.frame(), self.frames, noisy(eye.camera, rng), PERIOD)
+                known = trial.known
+                task = vect_align(
+                    frames, self.robot, known.attached, known.goal.alignment, self.settings, world=known.scene,
+                    constraints=known.constraints,
+                )  # fmt: skip
+                moved = None if task or count == LOOKS else self._moved(executor, trial, task, seed)
+                if moved is None:
+                    break
+                trial = moved
         finally:
-            eye.close()
+            for eye in eyes:
+                eye.close()
+        return task, trial
+
+    def _moved(self, executor: Executor, trial: Trial, task: SeenTask, seed: int) -> Trial | None:
+        """Move to a state from which cameras see what is missing, and return the trial that starts there, or None."""
+        known = self.seen_problem(task, trial.known)
+        for k, look in enumerate(task.looks):
+            end = dict(zip(self.robot.joint_names, look.state.tolist(), strict=True))
+            there = known.model_copy(update={"goal": Goal(joints=(end,)), "after": ()})
+            plan = self.runner.plan(there, seed + k, 0.0)
+            if plan and plan.trajectory is not None:
+                executor.move(f"look by {look.camera}", plan.trajectory)
+                q = executor.driver.commanded()
+                start = dict(zip(self.robot.joint_names, q.tolist(), strict=True))
+                return replace(trial, known=trial.known.model_copy(update={"start": start}))
+        return None
 
     def seen_problem(self, task: SeenTask, known: Problem) -> Problem:
         """Return the problem with objects and obstacles as they were seen.
@@ -229,9 +257,7 @@ class CameraRunner:
         for k, one in enumerate(task.seen):
             name = next(n for n in (f"seen_{k + 1}", f"seen_obstacle_{k + 1}") if n not in names)
             grown = [one.obstacle(name, margin) for margin in margins]
-            free = (
-                o for o in grown if CollisionChecker(self.robot, [o], task.attached, known.allowed).is_free(start)
-            )
+            free = (o for o in grown if CollisionChecker(self.robot, [o], task.attached, known.allowed).is_free(start))
             obstacles.append(next(free, grown[-1]))
         return known.model_copy(update={"scene": (*known.scene, *obstacles), "attached": task.attached})
 
@@ -271,9 +297,9 @@ def _cube(robot: Robot, known: Problem, rng: np.random.Generator, name: str) -> 
         place = rng.uniform(LOW, HIGH)
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = pin.utils.rotate("z", yaw), place
-        wide = Obstacle(name=name, box=(edge + 2.0 * CLEAR,) * 3, **pose_fields(pose))
+        wide = Obstacle.model_validate({"name": name, "box": (edge + 2.0 * CLEAR,) * 3, **pose_fields(pose)})
         if CollisionChecker(robot, [wide], known.attached, known.allowed).is_free(start):
-            return wide.model_copy(update={"box": (edge,) * 3})
+            return wide.model_copy(update={"box": (edge, edge, edge)})
     raise ParameterError("cubes", name, "fewer: there is no room for one that is clear of the robot")
 
 
