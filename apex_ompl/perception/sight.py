@@ -44,7 +44,7 @@ class Sight:
         parts = zip(self.frames, self.counts, self.cameras, strict=True)
         return {
             "cameras": [
-                {"name": frame.camera.name, "stamp": frame.stamp, "frames": count, **pose_fields(pose)}
+                {**pose_fields(pose), "name": frame.camera.name, "stamp": frame.stamp, "frames": count}
                 for frame, count, pose in parts
             ],
             "reasons": list(self.reasons), "left_out": list(self.task.left_out),
