@@ -38,9 +38,18 @@ def run(parsed: argparse.Namespace) -> int:
         check_writable(parsed.out)
     latency = -1.0 if parsed.latency is None else parsed.latency
     settings = LoopSettings(budget=parsed.budget, latency=latency, timeout=parsed.timeout, evade=parsed.evade)
+    driver, sensor = parsed.driver, None
+    if parsed.camera:
+        from apex_ompl.loop.camera_sensor import WIDTH, Cameras
+        from apex_ompl.perception.rig import default_cameras, load_cameras
+
+        if parsed.cubes:
+            raise ParameterError("--cubes", parsed.cubes, "a problem whose obstacles stand still")
+        cameras = load_cameras(parsed.cameras) if parsed.cameras else default_cameras(WIDTH)
+        driver, sensor = driver or "kinematic", Cameras(cameras, seed=parsed.seed or 0)
     result = api.run(
         environment, parsed.method, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed or 0,
-        speed=parsed.speed, settings=settings, driver=parsed.driver,
+        speed=parsed.speed, settings=settings, driver=driver, sensor=sensor,
     )  # fmt: skip
     if parsed.out is not None:
         result.save(parsed.out)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
@@ -101,8 +101,7 @@ def run_in(
                     driver = stack.enter_context(closing(named_driver(driver, environment.problem, setup.robot, clock)))
                 answers = ImmediateReplanning(context, replanner) if clock == SIMULATED else process
                 return run.driven(driver, answers, sensor, tolerance)
-            assert not is_factory(sensor)
-            stream = stream_of(sensor, environment, used.watched)
+            stream = stream_of(_made(sensor, None, environment), environment, used.watched)
             if clock == SIMULATED:
                 done = simulate(environment, context, replanner, stream, seed)
             else:
@@ -110,9 +109,26 @@ def run_in(
     return run.judged(done)
 
 
-def is_factory(sensor: object) -> TypeGuard[SensorFactory]:
+def is_factory(sensor: object) -> bool:
     """Whether a sensor is a function of driver and environment that makes one."""
     return callable(sensor) and not isinstance(sensor, Sensor) and not callable(getattr(sensor, "read", None))
+
+
+def _made(
+    sensor: Sensor | LiveSensor | SensorFactory, driver: Driver | None, environment: Environment
+) -> Sensor | LiveSensor:
+    """Return a sensor, made by the function that makes it of a driver and the environment.
+
+    Raises:
+        ParameterError: What a function made is no sensor.
+    """
+    found: Any = sensor
+    if is_factory(sensor):
+        found = found(driver, environment)
+    if not isinstance(found, Sensor) and not callable(getattr(found, "read", None)):
+        raise ParameterError("sensor", found, "a function that makes an object with read(now)")
+    made: Sensor | LiveSensor = found
+    return made
 
 
 def _completed(
@@ -211,9 +227,7 @@ class _Run:
             if not simulated:
                 warm_up(context, tuple(self.environment.present(0.0)), self.seed)
             zero = driver.time
-            used = sensor(driver, self.environment) if is_factory(sensor) else sensor
-            if not isinstance(used, Sensor) and not callable(getattr(used, "read", None)):
-                raise ParameterError("sensor", used, "a function that makes an object with read(now)")
+            used = _made(sensor, driver, self.environment)
             stream = stream_of(used, self.environment, context.settings.watched, zero)
             cycle = Cycle(
                 self.environment, context, answers, stream, self.seed, lead=context.settings.period,

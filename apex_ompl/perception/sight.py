@@ -42,11 +42,12 @@ class Sight:
     def as_dict(self) -> dict[str, Any]:
         """Return all numbers as plain data, in meters and radians."""
         parts = zip(self.frames, self.counts, self.cameras, strict=True)
+        cameras: list[dict[str, Any]] = [
+            {"name": frame.camera.name, "stamp": frame.stamp, "frames": count} | pose_fields(pose)
+            for frame, count, pose in parts
+        ]
         return {
-            "cameras": [
-                {**pose_fields(pose), "name": frame.camera.name, "stamp": frame.stamp, "frames": count}
-                for frame, count, pose in parts
-            ],
+            "cameras": cameras,
             "reasons": list(self.reasons), "left_out": list(self.task.left_out),
             "objects": [_held_dict(one) for one in self.task.held],
             "obstacles": [_obstacle_dict(one) for one in self.task.seen],
