@@ -43,7 +43,7 @@ class Sight:
         """Return all numbers as plain data, in meters and radians."""
         parts = zip(self.frames, self.counts, self.cameras, strict=True)
         cameras: list[dict[str, Any]] = [
-            {"name": frame.camera.name, "stamp": frame.stamp, "frames": count} | pose_fields(pose)
+            dict(pose_fields(pose), name=frame.camera.name, stamp=frame.stamp, frames=count)
             for frame, count, pose in parts
         ]
         return {
@@ -55,14 +55,14 @@ class Sight:
 
 
 def _held_dict(one: HeldObject) -> dict[str, Any]:
-    found = {"name": one.name, "link": one.body.link, "reason": one.reason, **pose_fields(one.pose)}
+    found: dict[str, Any] = {"name": one.name, "link": one.body.link, "reason": one.reason, **pose_fields(one.pose)}
     found |= {"face": one.face.tolist(), "axis": one.axis.tolist(), "scale": one.scale.tolist()}
     found |= {"face_spread": one.face_spread, "axis_spread": one.axis_spread, "seen": float(one.seen)}
     return {**found, "points": int(one.points), "covariance": one.covariance.tolist()}
 
 
 def _obstacle_dict(one: SeenObstacle) -> dict[str, Any]:
-    found = {"kind": one.kind, **pose_fields(one.pose), "size": one.size.tolist(), "place_spread": one.place_spread}
+    found: dict[str, Any] = {"kind": one.kind, **pose_fields(one.pose), "size": one.size.tolist(), "place_spread": one.place_spread}
     return {**found, "cut": bool(one.cut), "points": int(one.points), "covariance": one.covariance.tolist()}
 
 

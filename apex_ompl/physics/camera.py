@@ -17,6 +17,7 @@ import pinocchio as pin
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.drivers.grasps import in_link
 from apex_ompl.drivers.mujoco import MujocoDriver
+from apex_ompl.drivers.vessels import liquid
 from apex_ompl.errors import ParameterError
 from apex_ompl.perception.alignment import AlignSettings, SeenTask, vect_align
 from apex_ompl.perception.camera import Camera
@@ -43,7 +44,8 @@ FRAMES, PERIOD = 9, 0.1  # of a look, and time between two of them [s]
 CUBE = 0.06, 0.14  # edges of drawn cubes [m]
 LOW, HIGH = (0.25, -0.4, 0.12), (0.75, 0.4, 0.8)  # corners of the space of their centers [m]
 CLEAR = 0.04  # of the start from a drawn cube [m]
-TRIES = 200  # of a cube
+TRIES = 200  # of a cube, and of objects in hands
+APART = 0.005  # of objects from what they may not touch at the start [m]
 SHRINKS = (1.0, 0.5, 0.0)  # shares of the margin with which a seen obstacle may be clear of the robot at the start
 
 
@@ -185,17 +187,30 @@ class CameraRunner:
         trial = draw(self.robot, self.problem, seed, self.spread, self.runner.settings.density)
         rng = np.random.default_rng((seed or 0, 1))
         cubes = [_cube(self.robot, trial.known, rng, f"cube_{k + 1}") for k in range(self.cubes)]
-        spread = self.grasps
-        real = [
-            held if held.links is not None or held.touch_links == () else off_in_hand(held, rng, spread)
-            for held in trial.real.attached
-        ]
+        real = self._held(trial.real, trial.known, rng)
         names = {one.name for one in self.hidden}
         known = trial.known.model_copy(
             update={"scene": tuple(one for one in trial.known.scene if one.name not in names)}
         )
-        true = trial.real.model_copy(update={"scene": (*trial.real.scene, *cubes), "attached": tuple(real)})
+        true = trial.real.model_copy(update={"scene": (*trial.real.scene, *cubes), "attached": real})
         return Scene(replace(trial, known=known, real=true), (*self.hidden, *cubes))
+
+    def _held(self, real: Problem, known: Problem, rng: np.random.Generator) -> tuple[AttachedObject, ...]:
+        """Return objects that are off in the hands, clear of the scene and of links that may not touch them.
+
+        Where there are none in some tries, they are where the problem has them.
+        """
+        start, names = known.start_state(self.robot.joint_names), {held.name for held in known.attached}
+        solid = tuple(held for held in real.attached if held.name in names)  # liquids apart
+        least = min(0.5 * CollisionChecker(self.robot, real.scene, solid, real.allowed).clearance(start), APART)
+        for _ in range(TRIES):
+            found = tuple(
+                held if held.links is not None or held.touch_links == () else off_in_hand(held, rng, self.grasps)
+                for held in solid
+            )
+            if CollisionChecker(self.robot, real.scene, found, real.allowed).clearance(start) > least:
+                return (*found, *liquid(real.model_copy(update={"attached": found})))
+        return real.attached
 
     def look(self, executor: Executor, trial: Trial, seed: int) -> tuple[SeenTask, Trial]:
         """Return what cameras see, and the trial whose start is the state from which the robot looked last.
