@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from apex_ompl.perception.looking import LookSettings as LookSettings
     from apex_ompl.perception.looking import LookState as LookState
     from apex_ompl.perception.looking import ObjectView as ObjectView
+    from apex_ompl.perception.looking import look_plan as look_plan
     from apex_ompl.perception.looking import look_states as look_states
     from apex_ompl.perception.obstacles import ObstacleFinder as ObstacleFinder
     from apex_ompl.perception.obstacles import ObstacleSettings as ObstacleSettings
@@ -55,7 +56,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "frames": "Frame load_frames mean_frame save_sequence",
         "hand_eye": "Calibration View calibrate",
         "held": "HeldObject HeldObjectFinder HeldSettings",
-        "looking": "LookSettings LookState ObjectView look_states",
+        "looking": "LookSettings LookState ObjectView look_plan look_states",
         "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",

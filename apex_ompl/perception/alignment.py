@@ -152,14 +152,17 @@ def vect_align(
         reasons += missing
     seen = tuple(_as_seen(one, link) for one, link in zip(held, links, strict=True))
     states: tuple[LookState, ...] = ()
-    if world is not None and trusted and unknown:
+    sought = [one.name for one in chosen if one.name in unknown and one.body.contact is not None]
+    if world is not None and trusted and sought:
         limits = (s.look.place, s.look.turn) if alignment is None else _limits(alignment, len(chosen), s)
         states = look_states(
-            robot, seen, list(unknown), list({look.frame.camera.name: look.frame.camera for look in trusted}.values()),
+            robot, seen, sought, list({look.frame.camera.name: look.frame.camera for look in trusted}.values()),
             now.state, world=world, held=s.held, constraints=constraints, surface=surface,
             settings=replace(s.look, place=LOOKED * limits[0], turn=LOOKED * limits[1], seed=s.look.seed + len(looks)),
             avoided=[look.seen.registration.state for look in looks],
         )  # fmt: skip
+        if not states:
+            reasons.append(f"no free state was found from which a camera sees {' or '.join(map(repr, sought))}")
     vectors = tuple(_vector(one) for one in chosen) if not reasons else ()
     obstacles = tuple(one.obstacle(f"seen_{k + 1}", s.margin) for k, one in enumerate(found))
     return SeenTask(

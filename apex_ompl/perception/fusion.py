@@ -24,9 +24,15 @@ from apex_ompl.perception.surfaces import inverse
 from apex_ompl.types import Array
 
 CAMERA = 7  # errors of a camera: turn, shift, scale of depths
-MEASURED = 0.999  # share of the grasp's variance below which a look has measured a direction
+MEASURED = 0.95  # share of the grasp's variance below which a look has measured a direction
 ROUNDS = 3  # of the linearization of turns
-APART = 4.0  # mean squared difference of looks over what their covariances explain above which the object has moved
+SHARED = 1.15
+"""Factor of fused variances, for errors of surfaces and fingers that all looks have in common.
+
+It makes mean normalized squared errors those of chi-squared on scenes of their own.
+"""
+LARGE = 1.5  # mean squared difference of looks above which their covariances are too small
+APART = 4.0  # mean squared difference of looks over what their covariances explain above which one is wrong
 
 
 class Sighting(NamedTuple):
@@ -44,13 +50,13 @@ class Sighting(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Measurements along directions that are independent of each other, in units of the grasp's deviations.
+    """What a look measured, in units of the grasp's standard deviations.
 
     Attributes:
-        directions: Shape (n, 6).
-        camera: Derivatives by the camera's errors, in units of their deviations, shape (n, 7).
+        directions: Directions that it measured, shape (n, 6).
+        camera: Derivatives by the errors of calibration, in units of their standard deviations, shape (n, 7).
         values: Shape (n,).
-        information: Shape (n,).
+        information: Inverse of their covariance, shape (n, n).
     """
 
     directions: Array
@@ -73,19 +79,13 @@ def fused(sightings: Sequence[Sighting], link: Array, settings: HeldSettings) ->
         return _moved_along(sightings[-1], link)
     if len(answers) == 1:
         return _moved_along(answers[0], link)
-    names = list(dict.fromkeys(one.seen.camera.name for one in answers))
     spread = np.array([*np.radians(settings.grasp_turn), *settings.grasp_shift])
-    grasp = last.body.pose
-    best = min(answers, key=lambda one: float(np.trace(one.held.covariance / np.outer(spread, spread))))
-    pose = inverse(best.link) @ best.held.pose
-    solution, information, excess = np.zeros(6), np.eye(6), 1.0
-    for _ in range(ROUNDS):
-        expected = _off(grasp, pose) / spread
-        rows = [_rows(one, pose, expected, spread) for one in answers]
-        cameras = [names.index(one.seen.camera.name) for one in answers]
-        solution, information, excess = _solved(rows, cameras, len(names), expected)
-        pose = _shifted(pose, spread * solution)
-    covariance = np.asarray(np.linalg.inv(information)[:6, :6] * np.outer(spread, spread) * max(1.0, excess), float)
+    pose, covariance, excess = _fused(answers, spread)
+    if excess > APART and len(answers) > 2:
+        parts = [[one for one in answers if one is not left] for left in answers]
+        fits = [_fused(part, spread) for part in parts]
+        least = min(range(len(fits)), key=lambda k: fits[k][2])
+        answers, (pose, covariance, excess) = parts[least], fits[least]
     scale, size = _size([one.held for one in answers], settings)
     reason = ""
     if excess > APART:
@@ -95,6 +95,27 @@ def fused(sightings: Sequence[Sighting], link: Array, settings: HeldSettings) ->
         max(one.held.seen for one in answers), max(one.held.points for one in answers),
         min(one.held.misfit for one in answers),
     )  # fmt: skip
+
+
+def _fused(answers: Sequence[Sighting], spread: Array) -> tuple[Array, Array, float]:
+    """Return the pose in the frame of the link, its covariance, and the mean squared difference of the looks.
+
+    Args:
+        answers: The looks.
+        spread: Standard deviations of the grasp's turn and shift along the axes of the link, shape (6,).
+    """
+    names = list(dict.fromkeys(one.seen.camera.name for one in answers))
+    cameras = [names.index(one.seen.camera.name) for one in answers]
+    best = min(answers, key=lambda one: float(np.trace(one.held.covariance / np.outer(spread, spread))))
+    pose, information, excess = inverse(best.link) @ best.held.pose, np.eye(6), 1.0
+    for _ in range(ROUNDS):
+        expected = _off(best.held.body.pose, pose) / spread
+        rows = [_rows(one, pose, expected, spread) for one in answers]
+        solution, information, excess = _solved(rows, cameras, len(names), expected)
+        pose = _shifted(pose, spread * solution)
+    growth = SHARED * (excess if excess > LARGE else 1.0)
+    covariance = np.asarray(np.linalg.inv(information)[:6, :6] * np.outer(spread, spread) * growth, float)
+    return pose, covariance, excess
 
 
 def _moved_along(one: Sighting, link: Array) -> HeldObject:
@@ -127,15 +148,17 @@ def _rows(one: Sighting, pose: Array, expected: Array, spread: Array) -> _Rows:
     deviations = np.maximum(
         [*[camera.angle_spread] * 3, *[camera.position_spread] * 3, camera.depth.scale_spread], 1e-6
     )  # fmt: skip
-    left = calibration / deviations  # of the calibration's error, by the error in units of its deviations
-    common = np.kron(np.eye(2), rotation) @ one.held.lever @ left / spread[:, None]
-    own = covariance - common @ common.T
+    lever = np.kron(np.eye(2), rotation) @ one.held.lever / spread[:, None]
+    own = covariance - lever @ calibration @ lever.T
     variances, vectors = np.linalg.eigh((own + own.T) / 2.0)
     kept = variances < MEASURED
     variance, directions = np.maximum(variances[kept], 1e-6), vectors[:, kept].T
-    information = 1.0 / variance - 1.0
-    values = (directions @ value / variance - directions @ expected) / information
-    return _Rows(directions, (directions @ common) / (variance * information)[:, None], values, information)
+    precision = 1.0 / variance - 1.0  # without the grasp's
+    values = (directions @ value / variance - directions @ expected) / precision
+    slopes = directions @ lever / (variance * precision)[:, None]
+    left = calibration / deviations  # of the calibration's errors, in units of their standard deviations
+    noise = np.diag(1.0 / precision) + slopes @ (calibration - left @ left.T) @ slopes.T
+    return _Rows(directions, slopes @ left, values, np.asarray(np.linalg.inv(noise), float))
 
 
 def _solved(
@@ -151,13 +174,14 @@ def _solved(
         matrix[:, :6] = one.directions
         first = 6 + CAMERA * number
         matrix[:, first : first + CAMERA] = one.camera
-        information = information + matrix.T @ (one.information[:, None] * matrix)
-        vector = vector + matrix.T @ (one.information * one.values)
+        information = information + matrix.T @ one.information @ matrix
+        vector = vector + matrix.T @ one.information @ one.values
         matrices.append(matrix)
     solution = np.asarray(np.linalg.solve(information, vector), float)
     cost = float(np.sum((solution[:6] - expected) ** 2) + np.sum(solution[6:] ** 2))
     for one, matrix in zip(rows, matrices, strict=True):
-        cost += float(one.information @ (one.values - matrix @ solution) ** 2)
+        off = one.values - matrix @ solution
+        cost += float(off @ one.information @ off)
     return solution[:6], information, cost / max(1, sum(len(one.values) for one in rows))
 
 

@@ -51,6 +51,7 @@ MISFIT = 2.5  # mean squared error of points over that of noise above which cova
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 NOT_THERE = "no surface is seen where the hand holds it"
+FARTHEST = 36.0  # squared error of six dimensions that a grasp exceeds three times in a million
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
 
 
@@ -206,12 +207,14 @@ class _Region(NamedTuple):
         prior: Information before, shape (6, 6) or (9, 9).
         share: Independent measurements, over all points.
         pixels: Number of pixels that may be the object's.
+        outliers: Mean squared error over that of noise where half of the points are on no surface.
     """
 
     window: Window
     prior: Array
     share: float
     pixels: int
+    outliers: float
 
 
 class Expected(NamedTuple):
@@ -349,7 +352,9 @@ class HeldObjectFinder:
                         expected, prior, settings)
             for start in self._starts(one, expected, registration)
         ]  # fmt: skip
-        return self._answer(one, fits, seen, _Region(window, prior, settings.point_share * len(kept), count))
+        outliers = 0.5 / 3.0 * (settings.last / (noise * center[2] ** 2 + s.floor)) ** 2  # by Tukey's loss
+        region = _Region(window, prior, settings.point_share * len(kept), count, float(outliers))
+        return self._answer(one, fits, seen, region)
 
     def _fit_settings(self, one: Expected, seen: CorrectedFrame, window: Window, thinning: float) -> FitSettings:
         """Return the weights of points that stand for others, of pixels that share their noise in patches."""
@@ -381,7 +386,7 @@ class HeldObjectFinder:
         if not np.isfinite(best.cost):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
         misfit = best.cost / region.share
-        if misfit > self.settings.most_misfit:
+        if misfit > max(self.settings.most_misfit, region.outliers):
             return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
         factor = max(1.0, misfit / MISFIT) ** 2  # of the variances of measurements
         n = len(best.information)
@@ -406,9 +411,17 @@ class HeldObjectFinder:
         if share < self.settings.least_seen:
             return _without(one, f"{one.body.name!r} is hidden: {100 * share:.0f} % of it can be seen", count)
         size = np.sqrt(np.diag(covariance)[6:][one.ties]) if n > 6 else np.zeros(3)
-        world = turned(covariance[:6, :6], registration.pose[:3, :3])
+        world, found = turned(covariance[:6, :6], registration.pose[:3, :3]), registration.pose @ pose
+        if _far_from(one, found):
+            return _without(one, f"{one.body.name!r}: what is seen is not where the hand holds it", count)
         lever = np.kron(np.eye(2), registration.pose[:3, :3]) @ common[:6]
-        return HeldObject(one.body, "", registration.pose @ pose, world, best.scale, size, share, count, misfit, lever)
+        return HeldObject(one.body, "", found, world, best.scale, size, share, count, misfit, lever)
+
+
+def _far_from(one: Expected, pose: Array) -> bool:
+    """Whether an object is farther from its grasp than grasps vary."""
+    off = np.concatenate([pin.log3(pose[:3, :3] @ one.pose[:3, :3].T), pose[:3, 3] - one.pose[:3, 3]])
+    return float(off @ np.linalg.solve(one.covariance, off)) > FARTHEST
 
 
 def turned(covariance: Array, rotation: Array) -> Array:

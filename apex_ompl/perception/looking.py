@@ -42,6 +42,8 @@ from apex_ompl.util.validation import (
 
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
 STEPS = 30  # of inverse kinematics at most
+WIDE = 0.4  # visible share of a surface above which more says little
+UNSEEN = 5.0  # what an object without an answer counts against a standard deviation that is just small enough
 FACE_WEIGHT = 0.5  # of the visible share of the contact face against that of the whole surface
 
 
@@ -72,7 +74,10 @@ class LookSettings:
         joint_margin: Distance that joints keep from their limits [rad].
         proposals: Number of states that inverse kinematics starts from.
         predicted: Number of free states whose covariances are predicted.
+        rounds: Number of searches at most, while an object is not seen well enough from any state; all after the first
+            one are farther from the present state.
         apart: Least distance of states from each other, of the joint that moves most [rad].
+        avoid: The same from states that did not show enough [rad].
         least_cosine: Cosine between a surface's normal and the direction to the camera above which it is visible.
         motion: What a second of motion counts against a standard deviation that is just small enough.
         most: Number of states that are returned at most.
@@ -89,7 +94,9 @@ class LookSettings:
     joint_margin: float = 0.02
     proposals: int = 96
     predicted: int = 20
+    rounds: int = 3
     apart: float = 0.1
+    avoid: float = 0.3
     least_cosine: float = 0.2
     motion: float = 0.3
     most: int = 6
@@ -103,7 +110,7 @@ class LookSettings:
         """
         for name in ("place", "turn", "spread"):
             check_positive(getattr(self, name), name)
-        for name in ("frames", "proposals", "predicted", "most"):
+        for name in ("frames", "proposals", "predicted", "rounds", "most"):
             check_integer(getattr(self, name), name, 1)
         low, high = self.distance
         check_positive(low, "distance")
@@ -112,6 +119,7 @@ class LookSettings:
         check_number(self.border, "border", 0.0, 0.4)
         check_number(self.joint_margin, "joint_margin", 0.0, 0.5)
         check_number(self.apart, "apart", 0.0)
+        check_number(self.avoid, "avoid", 0.0)
         check_number(self.least_cosine, "least_cosine", 0.0, 0.99)
         check_number(self.motion, "motion", 0.0)
         check_seed(self.seed)
@@ -182,7 +190,8 @@ def look_states(
 
     States that show all wanted objects well enough come first, then those that show some of them, each by its expected
     standard deviations and its distance. If none shows all, look from the first one, then ask again for the objects
-    that it did not show. Hands stay closed as they are.
+    that it did not show, or take the order of :func:`look_plan`. Hands stay closed as they are. There is no state where
+    none was found in which a fit is expected to find an object.
 
     Args:
         robot: The robot.
@@ -207,20 +216,43 @@ def look_states(
     q = q.clip(robot.limits.lower, robot.limits.upper)
     wanted = _wanted(attached, names)
     checker = checker_of(world, robot, attached)
-    kept = ConstraintSet.of(robot, constraints, attached, q) if constraints else None
+    closed = any(one.links is not None for one in attached)
+    kept = ConstraintSet.of(robot, constraints, attached, q) if constraints or closed else None
     search = _Search(checker, {k: LinkFace.of_object(attached[k]) for k in wanted}, q, s, kept)
     predictor = ViewPredictor(
         robot, attached, checker.obstacles.values(), settings=held, seed=s.seed, surface=surface
     )  # fmt: skip
-    candidates = [one for camera in eyes for one in search.candidates(camera, predictor, len(eyes))]
-    candidates = [one for one in candidates if all(_apart(one.state, other) >= s.apart for other in avoided)]
-    chosen = _spread_over(candidates, wanted, s.predicted)
-    looks = [_look(one, predictor, wanted, s) for one in chosen]
+    looks: list[LookState] = []
+    for k in range(s.rounds):
+        candidates = [one for camera in eyes for one in search.candidates(camera, predictor, len(eyes), wide=k > 0)]
+        candidates = [one for one in candidates if all(_apart(one.state, other) >= s.avoid for other in avoided)]
+        looks += [_look(one, predictor, wanted, s) for one in _spread_over(candidates, wanted, s.predicted)]
+        if {name for look in looks for name in look.names} == {attached[n].name for n in wanted}:
+            break
     found: list[LookState] = []
     for look in sorted(looks, key=lambda one: _cost(one, s)):
-        if all(look.camera != one.camera or _apart(look.state, one.state) >= s.apart for one in found):
+        shows = any(not view.reason for view in look.objects)
+        if shows and all(look.camera != one.camera or _apart(look.state, one.state) >= s.apart for one in found):
             found.append(look)
     return tuple(found[: s.most])
+
+
+def look_plan(looks: Iterable[LookState]) -> tuple[LookState, ...]:
+    """Return the states, one after the other, that together show all objects that any of them shows well enough.
+
+    Args:
+        looks: States from :func:`look_states`, the best first.
+    """
+    left, chosen = list(looks), list[LookState]()
+    shown: set[str] = set()
+    while left:
+        best = max(left, key=lambda one: len({*one.names} - shown))  # the first one of several
+        if not {*best.names} - shown:
+            break
+        chosen.append(best)
+        left.remove(best)
+        shown |= {*best.names}
+    return tuple(chosen)
 
 
 def _apart(first: Array, second: Array) -> float:
@@ -300,6 +332,7 @@ class _Search:
         robot = checker.robot
         self._robot, self._faces, self._state, self._checker, self._settings = robot, faces, state, checker, settings
         self._links, self._constraints = Links.of(robot), constraints
+        self._rng = np.random.default_rng(settings.seed)
         synergies = [hand.synergy for hand in robot.hands.values() if hand.synergy is not None]
         self._hands: NDArray[np.intp] = np.array([robot.joint_names.index(name) for name in synergies], np.intp)
         low, high = robot.limits.lower, robot.limits.upper
@@ -307,10 +340,12 @@ class _Search:
         margin[self._hands] = 0.0
         self._lower, self._upper = low + margin, high - margin
 
-    def candidates(self, camera: Camera, predictor: ViewPredictor, cameras: int) -> list[_Candidate]:
-        """Return free states before one of a number of cameras, with what is visible there."""
+    def candidates(
+        self, camera: Camera, predictor: ViewPredictor, cameras: int, *, wide: bool
+    ) -> list[_Candidate]:  # fmt: skip
+        """Return free states before one of a number of cameras, with what is visible there; with ``wide`` far ones."""
         s = self._settings
-        states = self._free(self._proposals(camera, max(1, s.proposals // cameras)))
+        states = self._free(self._proposals(camera, max(1, s.proposals // cameras), wide=wide))
         found = []
         for q in states:
             visible = predictor.visible(camera, q, s.least_cosine)
@@ -322,18 +357,18 @@ class _Search:
         """Return the least time of a straight motion to a state at full speed [s]."""
         return float(np.max(np.abs(q - self._state) / self._robot.limits.velocity))
 
-    def _proposals(self, camera: Camera, count: int) -> Array:
+    def _proposals(self, camera: Camera, count: int, *, wide: bool) -> Array:
         """Return the present state and states in which faces are before a camera, shape (N, dof), near ones first.
 
         With several objects, half of them are states for all, and the others for each alone.
         """
-        s, rng = self._settings, np.random.default_rng(self._settings.seed)
+        s, rng = self._settings, self._rng
         every = tuple(self._faces)
         groups = [every] if len(every) == 1 else [every, *((k,) for k in every)]
-        found = [self._state]
+        found = [] if wide else [self._state]
         for k in range(count):
             group = groups[0] if k % 2 == 0 else groups[(k // 2) % len(groups)]
-            far = k / max(count - 1, 1)
+            far = 1.0 if wide else k / max(count - 1, 1)
             targets = [target for one in group for target in self._targets(camera, self._faces[one], far, rng)]
             inverse_kinematics = self._links.inverse(targets, self._hands)
             start = self._state.copy()
@@ -419,6 +454,12 @@ def _view(found: HeldObject, seen: Visible, settings: LookSettings) -> ObjectVie
 
 
 def _cost(one: LookState, settings: LookSettings) -> tuple[int, float]:
-    """Return the number of objects that are not seen well enough, and the sum of relative spreads and the motion."""
-    relative = [max(view.place_spread / settings.place, view.turn_spread / settings.turn) for view in one.objects]
-    return len(one.objects) - len(one.names), sum(relative) + settings.motion * one.duration
+    """Return the number of objects that are not seen well enough, and a sum of spreads, hidden shares and the motion.
+
+    The larger the share that is visible, the less it matters that objects are not exactly where they are believed.
+    """
+    total = settings.motion * one.duration
+    for view in one.objects:
+        total += max(view.place_spread / settings.place, view.turn_spread / settings.turn)
+        total += max(0.0, 1.0 - view.share / WIDE) + (UNSEEN if view.reason else 0.0)
+    return len(one.objects) - len(one.names), total
