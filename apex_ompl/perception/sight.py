@@ -62,7 +62,12 @@ def _held_dict(one: HeldObject) -> dict[str, Any]:
 
 
 def _obstacle_dict(one: SeenObstacle) -> dict[str, Any]:
-    found: dict[str, Any] = {"kind": one.kind, **pose_fields(one.pose), "size": one.size.tolist(), "place_spread": one.place_spread}
+    found: dict[str, Any] = {
+        "kind": one.kind,
+        **pose_fields(one.pose),
+        "size": one.size.tolist(),
+        "place_spread": one.place_spread,
+    }
     return {**found, "cut": bool(one.cut), "points": int(one.points), "covariance": one.covariance.tolist()}
 
 

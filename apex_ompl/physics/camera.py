@@ -22,6 +22,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.perception.alignment import AlignSettings, SeenTask, vect_align
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.held import HeldSettings
 from apex_ompl.perception.obstacles import ObstacleSettings
 from apex_ompl.perception.rig import check_cameras, default_cameras, misplaced, noisy, repeated
 from apex_ompl.perception.twin_camera import TwinCamera
@@ -39,6 +40,7 @@ from apex_ompl.util.validation import check_integer, check_number
 FURNITURE = (0.79, 0.65, 0.49, 1.0)  # color of what is known
 RED = (0.8, 0.1, 0.08, 1.0)  # of obstacles that are seen
 DEVIATIONS = 2.0  # of faces that have to be within the tolerance
+YIELD = 0.015  # by which fingers that yield may be off [m]
 LOOKS = 3  # from other states, at most
 FRAMES, PERIOD = 9, 0.1  # of a look, and time between two of them [s]
 CUBE = 0.06, 0.14  # edges of drawn cubes [m]
@@ -110,7 +112,9 @@ class CameraRunner:
     cubes: int = 0
     spread: Spread = field(default_factory=lambda: Spread(place=0.0))
     grasps: GraspSpread = field(default_factory=GraspSpread)
-    settings: AlignSettings = field(default_factory=lambda: AlignSettings(deviations=DEVIATIONS))
+    settings: AlignSettings = field(
+        default_factory=lambda: AlignSettings(held=HeldSettings(thickness=YIELD), deviations=DEVIATIONS)
+    )
     frames: int = FRAMES
     timeout: float = TIMEOUT
     friction: Collection[str] | None = None
