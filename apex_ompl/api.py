@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from apex_ompl.drivers.driver import Driver
     from apex_ompl.loop.environment import Environment, LiveSensor
     from apex_ompl.loop.result import RunResult
+    from apex_ompl.loop.run import SensorFactory
     from apex_ompl.loop.sensor import Sensor
     from apex_ompl.moving.replanner import Replanner
     from apex_ompl.moving.settings import LoopSettings
@@ -181,7 +182,7 @@ def run(
     seed: int = 0,
     speed: float = 1.0,
     settings: LoopSettings | None = None,
-    sensor: Sensor | LiveSensor | None = None,
+    sensor: Sensor | LiveSensor | SensorFactory | None = None,
     driver: Driver | str | None = None,
     tolerance: float = 0.05,
 ) -> RunResult:
@@ -203,7 +204,8 @@ def run(
         settings: Parameters of the loop; ``prediction`` counts instead of theirs. Their largest error and speed are by
             default those of the modeled sensor and the environment; for a sensor of your own they are required.
         sensor: How obstacles are observed: the model of a sensor, or one of your own, an object with ``read(now)``
-            (:class:`apex_ompl.loop.environment.LiveSensor`).
+            (:class:`apex_ompl.loop.environment.LiveSensor`), or a function that makes one of the driver and the
+            environment, such as :class:`apex_ompl.loop.Cameras`.
         driver: The robot, at rest at the start (:class:`apex_ompl.drivers.driver.Driver`), or a name: ``mujoco``, one
             in physics, or ``kinematic``. With ``clock="sim"`` its clock is advanced. By default the robot is exactly
             where it is commanded to be, and a step decides what it does at once, not from the next step on.

@@ -117,6 +117,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_view(commands)
     _add_convert(commands)
     _add_calibrate(commands)
+    _add_see(commands)
     _add_benchmark(commands)
     _add_check(commands)
     for name, text in (
@@ -235,6 +236,17 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
         "With mujoco a problem whose obstacles stand still is executed to the end of its task, to which of these "
         "options --seed, --timeout, --out, --film and --json apply",
     )  # fmt: skip
+    parser.add_argument(
+        "--camera", action="store_true", help="objects in the hands and obstacles are seen by simulated cameras and "
+        "not told; in physics, unless obstacles move",
+    )  # fmt: skip
+    parser.add_argument(
+        "--cameras", nargs="+", type=Path, default=[], metavar="FILE", help="camera files for --camera (default: two, "
+        "before the robot and above)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--cubes", type=int, default=0, metavar="N", help="red cubes in the way of a task with --camera (default: 0)"
+    )
     parser.add_argument("--film", type=Path, metavar="FILE", help="write a film of a task in physics: .mp4")
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the run: .npz or .json")
     parser.add_argument("--json", action="store_true", help="print the outcome and the metrics as JSON")
@@ -303,6 +315,20 @@ def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--offsets", default="", metavar="J1,J2,...", help="joints whose readings may be off")
     parser.add_argument("--robot", default="dual_panda_softhand", help="robot name or file (default: %(default)s)")
     parser.set_defaults(run="perception:calibrate")
+
+
+def _add_see(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("see", help="find held objects and obstacles in frames of a camera")
+    parser.add_argument(
+        "frames", type=Path, nargs="+", metavar="FRAMES", help="a frame (.npz) or a folder of frames of each camera"
+    )
+    parser.add_argument("--problem", metavar="PROBLEM", help="whose robot holds the objects (default: none are held)")
+    parser.add_argument(
+        "--robot", default="dual_panda_softhand", help="without --problem: robot name or file (default: %(default)s)"
+    )
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="draw what was found into the picture: .png")
+    parser.add_argument("--json", action="store_true", help="print what was found, with covariances, as JSON")
+    parser.set_defaults(run="perception:see")
 
 
 def _add_benchmark(commands: Commands[argparse.ArgumentParser]) -> None:

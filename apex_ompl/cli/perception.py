@@ -1,18 +1,26 @@
-"""The command ``apex-ompl calibrate``."""
+"""The commands ``apex-ompl calibrate`` and ``apex-ompl see``."""
 
 from __future__ import annotations
 
 import argparse
+import json
 from typing import Any
 
 import numpy as np
 
+from apex_ompl.api import load_problem
 from apex_ompl.errors import FileFormatError, ParameterError
 from apex_ompl.perception import Board, Camera, View, load_frames, measured_depths
 from apex_ompl.perception import calibrate as calibrate_views
+from apex_ompl.perception import see as see_frames
+from apex_ompl.perception.drawing import picture_of, png_of
 from apex_ompl.perception.hand_eye import FEWEST_VIEWS
+from apex_ompl.perception.held import HeldObject
+from apex_ompl.perception.obstacles import SeenObstacle
+from apex_ompl.perception.sight import Sight
 from apex_ompl.robot import load_robot
-from apex_ompl.util.files import check_writable, suffix_of
+from apex_ompl.util.display import counted
+from apex_ompl.util.files import check_writable, suffix_of, write_atomically
 
 BOARD = "KIND:COLUMNSxROWS:SQUARE, of meters and inner corners, as charuco:9x6:0.025, or tag:SIDE"
 
@@ -57,6 +65,53 @@ def calibrate(parsed: argparse.Namespace) -> int:
         noise = 1e3 * depth.noise
         print(f"  depth       scale {depth.scale:.4f}, +- {depth.scale_spread:.4f}, noise {noise:.2f} mm at 1 m")
     return 0
+
+
+def see(parsed: argparse.Namespace) -> int:
+    """Find held objects and obstacles in frames, print and draw them, and return 0, or 1 where something is missing."""
+    if parsed.out is not None:
+        suffix_of(parsed.out, (".png",))
+        check_writable(parsed.out)
+    problem = None if parsed.problem is None else load_problem(parsed.problem)
+    robot = load_robot(parsed.robot if problem is None else problem.robot)
+    attached, alignment = ((), None) if problem is None else (problem.attached, problem.goal.alignment)
+    frames = [frame for source in parsed.frames for frame in load_frames(source)]
+    found = see_frames(frames, robot, attached, alignment)
+    if parsed.out is not None:
+        write_atomically(parsed.out, png_of(picture_of(found)))
+    if parsed.json:
+        print(json.dumps(found.as_dict()))
+    else:
+        _print_sight(found)
+    return 0 if found else 1
+
+
+def _print_sight(found: Sight) -> None:
+    """Print what was seen, a line each."""
+    for frame, count in zip(found.frames, found.counts, strict=True):
+        print(f"{frame.camera.name}: {counted(count, 'frame')} up to {frame.stamp:.3f} s")
+    for one in found.task.held:
+        print(f"  object    {_held_line(one)}")
+    for seen in found.task.seen:
+        print(f"  obstacle  {_obstacle_line(seen)}")
+    for reason in found.reasons:
+        print(f"  reason    {reason}")
+    for reason in found.task.left_out:
+        print(f"  left out  {reason}")
+
+
+def _held_line(one: HeldObject) -> str:
+    if one.reason:
+        return f"{one.name}: not found, where its grasp has it {_numbers(one.pose[:3, 3])} m"
+    face = f"face at {_numbers(one.face)} m, +- {1e3 * one.face_spread:.1f} mm"
+    axis = f"axis {_numbers(one.axis)}, +- {np.rad2deg(one.axis_spread):.1f} degrees"
+    return f"{one.name}: {face}, {axis}, {100.0 * one.seen:.0f} % seen"
+
+
+def _obstacle_line(one: SeenObstacle) -> str:
+    cut = ", cut by the image" if one.cut else ""
+    size = " x ".join(f"{1e3 * value:.0f}" for value in one.size)
+    return f"{one.kind} {size} mm at {_numbers(one.pose[:3, 3])} m, +- {1e3 * one.place_spread:.1f} mm{cut}"
 
 
 def _check_image(camera: Camera, other: Camera, k: int, *, intrinsics: bool) -> None:

@@ -23,8 +23,12 @@ def run(parsed: argparse.Namespace) -> int:
     """Run the loop, or a task in physics, write the run, print it, and return the exit code."""
     if parsed.driver is not None:
         check_name(parsed.driver, "driver", DRIVERS)
+    for option in ("cameras", "cubes"):
+        if getattr(parsed, option) and not parsed.camera:
+            raise ParameterError(f"--{option}", getattr(parsed, option), "it with --camera")
     environment = api.load_environment(parsed.world)
-    if parsed.driver == "mujoco" and isinstance(environment, ScriptedEnvironment) and environment.still:
+    physics = parsed.driver == "mujoco" or (parsed.camera and parsed.driver is None)
+    if physics and isinstance(environment, ScriptedEnvironment) and environment.still:
         return _execute(environment.problem, parsed)
     if parsed.film is not None:
         expected = "a problem whose obstacles stand still, with --driver mujoco; films of runs: apex-ompl render"
@@ -34,9 +38,18 @@ def run(parsed: argparse.Namespace) -> int:
         check_writable(parsed.out)
     latency = -1.0 if parsed.latency is None else parsed.latency
     settings = LoopSettings(budget=parsed.budget, latency=latency, timeout=parsed.timeout, evade=parsed.evade)
+    driver, sensor = parsed.driver, None
+    if parsed.camera:
+        from apex_ompl.loop.camera_sensor import WIDTH, Cameras
+        from apex_ompl.perception.rig import default_cameras, load_cameras
+
+        if parsed.cubes:
+            raise ParameterError("--cubes", parsed.cubes, "a problem whose obstacles stand still")
+        cameras = load_cameras(parsed.cameras) if parsed.cameras else default_cameras(WIDTH)
+        driver, sensor = driver or "kinematic", Cameras(cameras, seed=parsed.seed or 0)
     result = api.run(
         environment, parsed.method, clock=parsed.clock, prediction=parsed.prediction, seed=parsed.seed or 0,
-        speed=parsed.speed, settings=settings, driver=parsed.driver,
+        speed=parsed.speed, settings=settings, driver=driver, sensor=sensor,
     )  # fmt: skip
     if parsed.out is not None:
         result.save(parsed.out)
@@ -61,7 +74,14 @@ def _execute(problem: Problem, parsed: argparse.Namespace) -> int:
             check_writable(file)
     if parsed.film is not None:
         import_extra("imageio.v3", "films", "viz")  # which is missed now, not after the run
-    runner = TaskRunner(problem, timeout=parsed.timeout)
+    if parsed.camera:
+        from apex_ompl.perception.rig import default_cameras, load_cameras
+        from apex_ompl.physics.camera import CameraRunner
+
+        cameras = load_cameras(parsed.cameras) if parsed.cameras else default_cameras()
+        runner: TaskRunner | CameraRunner = CameraRunner(problem, cameras, parsed.cubes, timeout=parsed.timeout)
+    else:
+        runner = TaskRunner(problem, timeout=parsed.timeout)
     result, frames = runner.run(parsed.seed, FILM_SIZE if parsed.film is not None else None)
     if parsed.out is not None:
         result.save(parsed.out)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from apex_ompl.loop.camera_sensor import Cameras as Cameras
+    from apex_ompl.loop.camera_sensor import CameraSensor as CameraSensor
     from apex_ompl.loop.environment import Environment as Environment
     from apex_ompl.loop.environment import LiveSensor as LiveSensor
     from apex_ompl.loop.environment import Observation as Observation
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "camera_sensor": "Cameras CameraSensor",
         "environment": "Environment LiveSensor Observation",
         "loop": "Command Loop",
         "result": "Event Outcome RunResult",

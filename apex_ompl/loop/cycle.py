@@ -20,7 +20,7 @@ class Cycle(Control):
 
     def __init__(
         self, environment: Environment, context: RunContext, replanning: Replanning, sensor: ObservationSource,
-        seed: int, *, lead: float = 0.0,
+        seed: int, *, lead: float = 0.0, named: bool = True,
     ) -> None:  # fmt: skip
         """Set up a run with the robot at rest at the start.
 
@@ -31,10 +31,12 @@ class Cycle(Control):
             sensor: Observes the environment.
             seed: Seed of random choices.
             lead: How long before a step it is decided [s].
+            named: Whether the sensor gives obstacles the names that they have in the environment.
         """
+        self._named = named
         self._environment, self._sensor = environment, sensor
         self._present: tuple[Obstacle, ...] = tuple(environment.present(0.0))
-        super().__init__(context, replanning, seed, awaited={o.name for o in self._present}, lead=lead)
+        super().__init__(context, replanning, seed, awaited={o.name for o in self._present if named}, lead=lead)
         self._waiting: list[Observation] = []
         self._started, self._broken, self._present_time = False, 0, 0.0
 
@@ -62,7 +64,7 @@ class Cycle(Control):
             else:
                 self.take(observation, now)
         self._waiting = later
-        self._broken += unexpected(self.tracker, self._present, now)
+        self._broken += unexpected(self.tracker, self._present, now, named=self._named)
 
     def step(self, now: float) -> RunRecord | None:
         """Decide what the robot does from a time on [s], and return the record of the run where it is over."""
@@ -84,10 +86,18 @@ class Cycle(Control):
             self._started = True
 
 
-def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float) -> bool:
-    """Whether an obstacle violates the assumptions of the guarantee: unseen, or outside its reachable set."""
+def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float, *, named: bool = True) -> bool:
+    """Whether an obstacle violates the assumptions of the guarantee: unseen, or outside its reachable set.
+
+    Args:
+        tracker: The estimates.
+        present: The obstacles.
+        now: The time [s].
+        named: Whether estimates have the names of obstacles; otherwise any may be that of an obstacle.
+    """
+    tracks = (*tracker.tracks.values(), *tracker.doubted)
     for o in present:
-        known = [track for track in (*tracker.tracks.values(), *tracker.doubted) if track.shape.name == o.name]
+        known = [track for track in tracks if track.shape.name == o.name or not named]
         if not any(tracker.may_be(track, o, now) for track in known):
             return True
     return False

@@ -79,7 +79,11 @@ class ObservationSource(Protocol):
 
 
 class LiveSensor(Protocol):
-    """A sensor of one's own."""
+    """A sensor of one's own.
+
+    With an attribute ``named`` that is false, names of obstacles are its own and not those of the environment: the
+    robot then starts with the first observation, whatever is in it.
+    """
 
     def read(self, now: float) -> Observation | None:
         """Return what it saw since the last call, or None; called once in each period.

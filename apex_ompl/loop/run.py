@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -15,6 +15,7 @@ from apex_ompl.drivers.driver import Driver
 from apex_ompl.drivers.kinematic import KinematicDriver
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import ParameterError
+from apex_ompl.loop.camera_sensor import Cameras
 from apex_ompl.loop.clocks import cores, run_in_real_time, simulate, undisturbed, warm_up
 from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.cycle import Cycle
@@ -41,13 +42,16 @@ from apex_ompl.util.validation import check_name, check_number, check_seed
 
 DRIVERS = ("kinematic", "mujoco")
 """Names of drivers that can be made for a problem."""
+SensorFactory = Callable[[Driver, Environment], LiveSensor]
+"""Makes a sensor that needs the driver and the environment, such as :class:`apex_ompl.loop.Cameras`."""
 CLOCKS = SIMULATED, REAL = "sim", "real"
 
 
 def run_in(
     environment: Environment, method: str | Replanner = "apex", *, clock: str = "sim", prediction: str = "cv",
     seed: int = 0, speed: float = 1.0, settings: LoopSettings | None = None,
-    sensor: Sensor | LiveSensor | None = None, driver: Driver | str | None = None, tolerance: float = TOLERANCE,
+    sensor: Sensor | LiveSensor | SensorFactory | None = None, driver: Driver | str | None = None,
+    tolerance: float = TOLERANCE,
 ) -> RunResult:  # fmt: skip
     """Let a robot go to a goal in an environment whose obstacles move; see :func:`apex_ompl.run` for the arguments.
 
@@ -64,6 +68,8 @@ def run_in(
     if environment.ran:
         raise ParameterError("problem", environment.name, "an environment without a run so far: load it again")
     sensor = sensor or Sensor(seed=seed)
+    if is_factory(sensor) and driver is None:
+        raise ParameterError("driver", None, "a driver, whose robot the sensor sees")
     settings = _completed(settings or LoopSettings(), sensor, environment)
     check_number(tolerance, "tolerance", 0.0, np.pi)
     used = replace(replace(settings, prediction=prediction), **replanning.settings)
@@ -95,7 +101,7 @@ def run_in(
                     driver = stack.enter_context(closing(named_driver(driver, environment.problem, setup.robot, clock)))
                 answers = ImmediateReplanning(context, replanner) if clock == SIMULATED else process
                 return run.driven(driver, answers, sensor, tolerance)
-            stream = stream_of(sensor, environment, used.watched)
+            stream = stream_of(_made(sensor, None, environment), environment, used.watched)
             if clock == SIMULATED:
                 done = simulate(environment, context, replanner, stream, seed)
             else:
@@ -103,7 +109,31 @@ def run_in(
     return run.judged(done)
 
 
-def _completed(settings: LoopSettings, sensor: Sensor | LiveSensor, environment: Environment) -> LoopSettings:
+def is_factory(sensor: object) -> bool:
+    """Whether a sensor is a function of driver and environment that makes one."""
+    return callable(sensor) and not isinstance(sensor, Sensor) and not callable(getattr(sensor, "read", None))
+
+
+def _made(
+    sensor: Sensor | LiveSensor | SensorFactory, driver: Driver | None, environment: Environment
+) -> Sensor | LiveSensor:
+    """Return a sensor, made by the function that makes it of a driver and the environment.
+
+    Raises:
+        ParameterError: What a function made is no sensor.
+    """
+    found: Any = sensor
+    if is_factory(sensor):
+        found = found(driver, environment)
+    if not isinstance(found, Sensor) and not callable(getattr(found, "read", None)):
+        raise ParameterError("sensor", found, "a function that makes an object with read(now)")
+    made: Sensor | LiveSensor = found
+    return made
+
+
+def _completed(
+    settings: LoopSettings, sensor: Sensor | LiveSensor | SensorFactory, environment: Environment
+) -> LoopSettings:
     """Return the settings with a largest error and a largest speed of obstacles.
 
     Raises:
@@ -111,8 +141,10 @@ def _completed(settings: LoopSettings, sensor: Sensor | LiveSensor, environment:
     """
     if isinstance(sensor, Sensor):
         return settings.completed(sensor.largest_error, environment.fastest)
-    if not callable(getattr(sensor, "read", None)):
-        raise ParameterError("sensor", sensor, "a Sensor, or an object with read(now)")
+    if isinstance(sensor, Cameras):
+        return settings.completed(sensor.error, environment.fastest)
+    if not callable(getattr(sensor, "read", None)) and not is_factory(sensor):
+        raise ParameterError("sensor", sensor, "a Sensor, an object with read(now), or a function that makes one")
     missing = [name for name in ("error", "fastest") if getattr(settings, name) is None]
     if missing:
         raise ParameterError("settings", f"no {' and no '.join(missing)}", "both, for a sensor of one's own")
@@ -137,8 +169,11 @@ def named_driver(name: str, problem: Problem, robot: Robot, clock: str) -> Drive
     return MujocoDriver(robot, problem.still, state=start)
 
 
-def _noted(sensor: Sensor | LiveSensor) -> dict[str, Any]:
+def _noted(sensor: Sensor | LiveSensor | SensorFactory) -> dict[str, Any]:
     """Return what a result says of a sensor."""
+    if isinstance(sensor, Cameras):
+        names = [camera.name for camera in sensor.cameras]
+        return {"name": "Cameras", "cameras": names, "rate": sensor.rate, "latency": sensor.latency}
     return asdict(sensor) if isinstance(sensor, Sensor) else {"name": type(sensor).__name__}
 
 
@@ -179,15 +214,25 @@ class _Run:
             robot_digest=digest(robot),
         )  # fmt: skip
 
-    def driven(self, driver: Driver, answers: Replanning, sensor: Sensor | LiveSensor, tolerance: float) -> RunResult:
-        """Run on a driver's clock, and return the result."""
+    def driven(
+        self, driver: Driver, answers: Replanning, sensor: Sensor | LiveSensor | SensorFactory, tolerance: float
+    ) -> RunResult:
+        """Run on a driver's clock, and return the result.
+
+        Raises:
+            ParameterError: What a function made is no sensor.
+        """
         context, simulated = self.context, self.clock == SIMULATED
         with nullcontext() if simulated else undisturbed(cores()[0]):
             if not simulated:
                 warm_up(context, tuple(self.environment.present(0.0)), self.seed)
             zero = driver.time
-            stream = stream_of(sensor, self.environment, context.settings.watched, zero)
-            cycle = Cycle(self.environment, context, answers, stream, self.seed, lead=context.settings.period)
+            used = _made(sensor, driver, self.environment)
+            stream = stream_of(used, self.environment, context.settings.watched, zero)
+            cycle = Cycle(
+                self.environment, context, answers, stream, self.seed, lead=context.settings.period,
+                named=getattr(used, "named", True),
+            )  # fmt: skip
             run = DrivenRun(cycle, driver, zero, simulated, tolerance)
             done = run.run()
         return self.judged(done, run.executed())

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
     from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
     from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
+    from apex_ompl.perception.sight import Sight as Sight
+    from apex_ompl.perception.sight import see as see
     from apex_ompl.perception.solid_fit import KnownSize as KnownSize
     from apex_ompl.perception.synchronizer import Synchronizer as Synchronizer
     from apex_ompl.perception.tracking import ObstacleTracker as ObstacleTracker
@@ -60,6 +62,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",
         "solid_fit": "KnownSize",
+        "sight": "Sight see",
         "synchronizer": "Synchronizer",
         "tracking": "ObstacleTracker TrackedObstacle TrackerSettings",
         "twin_camera": "TwinCamera",

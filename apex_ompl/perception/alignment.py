@@ -76,7 +76,7 @@ class SeenTask:
 
     Attributes:
         reasons: Why there is no task, as sentences; empty where there is one.
-        alignment: The alignment, of the objects of ``attached``.
+        alignment: The alignment, of the objects of ``attached``, where there is one.
         attached: The held objects as they were seen.
         vectors: Contact faces of both objects as vectors in the world; empty without a task.
         obstacles: Obstacles, larger by the margin; of boxes seen from one side it may be too small.
@@ -90,7 +90,7 @@ class SeenTask:
     """
 
     reasons: tuple[str, ...]
-    alignment: Alignment
+    alignment: Alignment | None
     attached: tuple[AttachedObject, ...]
     vectors: tuple[WorldVector, ...]
     obstacles: tuple[Obstacle, ...]
@@ -107,7 +107,7 @@ class SeenTask:
 
 
 def vect_align(
-    frames: Frame | Sequence[Frame], robot: Robot, attached: Sequence[AttachedObject], alignment: Alignment,
+    frames: Frame | Sequence[Frame], robot: Robot, attached: Sequence[AttachedObject], alignment: Alignment | None,
     settings: AlignSettings | None = None, *, world: World = None, constraints: Sequence[Constraint] = (),
 ) -> SeenTask:  # fmt: skip
     """Return the task that frames show: faces to be aligned, held objects and obstacles.
@@ -119,7 +119,8 @@ def vect_align(
         frames: A frame, or several, with the positions of all joints.
         robot: The robot.
         attached: The objects that it holds, at the poses that grasps give them.
-        alignment: What is to be aligned: the names of two of these objects, or of one and a hand.
+        alignment: What is to be aligned: the names of two of these objects, or of one and a hand. Without one all
+            objects have to be found.
         settings: The settings.
         world: What states to look from are free of: a checker, a planner's world or obstacles. Without one no states
             are sought.
@@ -130,7 +131,8 @@ def vect_align(
     """
     s = settings or AlignSettings()
     shots = [frames] if isinstance(frames, Frame) else list(frames)
-    wanted = _wanted(alignment, [one.name for one in attached], robot)
+    names = [one.name for one in attached]
+    wanted = {*names} if alignment is None else _wanted(alignment, names, robot)
     surface = RobotSurface(robot)
     finder = HeldObjectFinder(robot, attached, s.held, surface)
     looks = [_look(own, finder, surface, s) for own in looks_of(shots)]
@@ -154,7 +156,7 @@ def vect_align(
     states: tuple[LookState, ...] = ()
     sought = [one.name for one in chosen if one.name in unknown and one.body.contact is not None]
     if world is not None and trusted and sought:
-        place, turn = _limits(alignment, len(chosen), s)
+        place, turn = (s.look.place, s.look.turn) if alignment is None else _limits(alignment, len(chosen), s)
         cameras = {look.frame.camera.name: look.frame.camera for look in trusted}
         reported = [look.frame.state(robot.joint_names) for look in looks]
         states = look_states(
@@ -245,9 +247,11 @@ def _limits(alignment: Alignment, count: int, settings: AlignSettings) -> tuple[
 
 
 def _tolerance_reason(
-    one: HeldObject, chosen: Sequence[HeldObject], alignment: Alignment, settings: AlignSettings
+    one: HeldObject, chosen: Sequence[HeldObject], alignment: Alignment | None, settings: AlignSettings
 ) -> str:  # fmt: skip
     """Return why an object is not known well enough for the tolerance, or an empty text."""
+    if alignment is None:
+        return ""
     place, turn = _limits(alignment, len(chosen), settings)
     if one.place_spread <= place and one.turn_spread <= turn:
         return ""

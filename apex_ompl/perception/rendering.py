@@ -134,7 +134,7 @@ class ZBuffer:
             np.where(there, labels[index], 0),
             np.where(there[..., None], normals[index], 0.0),
         )
-        return _seen_through(camera, view)
+        return seen_through(camera, view)
 
 
 class Mujoco:
@@ -178,7 +178,7 @@ class Mujoco:
         there = number >= 0
         depth = np.where(there, depth, 0.0)
         labels = np.where(there, np.array([part.label for part in parts])[number], 0)
-        return _seen_through(camera, View(depth, labels, depth_normals(depth, camera)))
+        return seen_through(camera, View(depth, labels, depth_normals(depth, camera)))
 
     def _add(self, spec: Any, part: Part, k: int) -> None:
         """Add a part as one geom."""
@@ -233,7 +233,7 @@ def _together(parts: Sequence[Part]) -> tuple[Array, Indices, Indices]:
     return np.concatenate([part.surface.vertices for part in parts]), np.concatenate(faces), np.concatenate(labels)
 
 
-def _seen_through(camera: Camera, view: View) -> View:
+def seen_through(camera: Camera, view: View) -> View:
     """Return the view of a pinhole as a camera with distortion has it."""
     if not any(camera.distortion):
         return view

@@ -7,23 +7,27 @@ where the camera has distortion, that image is larger, and is sampled at the ray
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.collision.shapes import coal_geometry
+from apex_ompl.drivers.geoms import geom_shapes
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.perception.camera import LARGEST_IMAGE, Camera
 from apex_ompl.perception.frames import Frame, check_camera
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_number, check_positive
 
 BACKGROUND = 0.999  # share of the distance of the far plane from which on nothing is seen
+RED = (0.8, 0.1, 0.08, 1.0)  # of obstacles that are not simulated
 HINT = "install libegl1 or libosmesa6, and set MUJOCO_GL to egl or osmesa"
 
 
@@ -39,6 +43,7 @@ class TwinCamera:
     def __init__(
         self, driver: MujocoDriver, camera: Camera, *, reported: Camera | None = None,
         measured: Callable[[Array], Array] | None = None,
+        others: Callable[[float], Iterable[Obstacle]] | None = None,
     ) -> None:  # fmt: skip
         """Set up the images; they are drawn by :meth:`frame`.
 
@@ -49,6 +54,7 @@ class TwinCamera:
                 one that was moved since its calibration.
             measured: Function from exact depths, shape (height, width) [m], 0 where there is none, to measured ones, as
                 floats [m] or whole numbers [mm]; by default they are exact.
+            others: Returns obstacles that are seen, in red, and not simulated, by the time [s], of primitives.
 
         Raises:
             ApexError: The robot has no such link, the other camera has another size, the distortion needs an image that
@@ -66,7 +72,7 @@ class TwinCamera:
             raise ParameterError("reported", size, f"a camera of {camera.width} x {camera.height} pixels")
         if camera.link is not None:
             driver.robot.link_frame(camera.link)
-        self._measured = measured
+        self._measured, self._others = measured, others
         self._sampling = _Sampling.of(camera)
         self._renderers: list[Any] = []
 
@@ -88,8 +94,9 @@ class TwinCamera:
         twin.move_obstacles(driver.data, state.stamp)
         mujoco().mj_kinematics(twin.model, driver.data)  # a step leaves the poses from before it
         pose = self.camera.pose if self.camera.link is None else driver.pose(self.camera.link) @ self.camera.pose
+        others = () if self._others is None else tuple(self._others(state.stamp))
         drawing, measuring = self._opened()
-        depth = self._drawn(measuring, pose)
+        depth = self._drawn(measuring, pose, others)
         far = BACKGROUND * twin.model.vis.map.zfar * twin.model.stat.extent
         true = self._sampling.depths(np.where(depth < far, depth, 0.0), lambda: self._shapes(measuring))
         errors = self.camera.depth
@@ -97,8 +104,9 @@ class TwinCamera:
         seen = true / errors.scale
         if self._measured is not None:
             seen = self._measured(seen)
+        colors = self._sampling.colors(self._drawn(drawing, pose, others))
         joints = dict(zip(driver.names, state.positions.tolist(), strict=True))
-        return Frame(self.reported, seen, self._sampling.colors(self._drawn(drawing, pose)), state.stamp, joints)
+        return Frame(self.reported, seen, colors, state.stamp, joints)
 
     def frames(self, until: float, rate: float) -> Iterator[Frame]:
         """Let the driver go on up to a time on its clock [s], and yield a frame now and at a rate [Hz].
@@ -138,8 +146,8 @@ class TwinCamera:
             self._renderers[1].enable_depth_rendering()
         return self._renderers
 
-    def _drawn(self, renderer: Any, pose: Array) -> NDArray[Any]:
-        """Return the image of a renderer for a pose of the optical frame, shape (4, 4)."""
+    def _drawn(self, renderer: Any, pose: Array, others: Iterable[Obstacle]) -> NDArray[Any]:
+        """Return the image of a renderer for a pose of the optical frame, shape (4, 4), with other obstacles."""
         twin, sampling = self.driver.twin, self._sampling
         renderer.update_scene(self.driver.data, twin.camera(0.0, 0.0, 1.0, (0.0, 0.0, 0.0)))
         near = twin.model.vis.map.znear * twin.model.stat.extent
@@ -151,6 +159,8 @@ class TwinCamera:
             eye.frustum_center, eye.frustum_width = 0.5 * (left + right), 0.5 * (right - left)
             eye.frustum_top, eye.frustum_bottom = -top, -bottom
             eye.frustum_near, eye.frustum_far = near, far
+        for one in others:
+            _add(renderer.scene, one)
         return np.array(renderer.render())
 
     def _shapes(self, renderer: Any) -> NDArray[Any]:
@@ -159,6 +169,24 @@ class TwinCamera:
         found = np.array(renderer.render())[..., 0]
         renderer.enable_depth_rendering()
         return found
+
+
+def _add(scene: Any, obstacle: Obstacle) -> None:
+    """Add an obstacle to what is drawn.
+
+    Raises:
+        ParameterError: It is no primitive, or there are too many.
+    """
+    library = mujoco()
+    for shape in geom_shapes(coal_geometry(obstacle), obstacle.pose, obstacle.name):
+        if shape.vertices is not None or scene.ngeom >= scene.maxgeom:
+            raise ParameterError("obstacle", obstacle.name, "a box, ball, cylinder or capsule that can be drawn")
+        kind, (first, *_, last) = getattr(library.mjtGeom, f"mjGEOM_{shape.kind}"), (*shape.size, shape.size[-1])
+        size = np.array(shape.size if len(shape.size) == 3 else (first, first, last))  # radius twice, then half length
+        turn = np.ascontiguousarray(shape.pose[:3, :3]).ravel()
+        rgba = np.array(RED, np.float32)
+        library.mjv_initGeom(scene.geoms[scene.ngeom], kind, size, shape.pose[:3, 3].copy(), turn, rgba)
+        scene.ngeom += 1
 
 
 @dataclass(frozen=True, eq=False)

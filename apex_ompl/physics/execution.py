@@ -74,16 +74,17 @@ def rehearsed(robot: Robot, trial: Trial, motion: Trajectory, settings: TwinSett
 
 
 class Executor:
-    """Executes one task.
+    """Executes one task: :meth:`grasp`, then :meth:`run` with a plan, with motions by :meth:`move` between them.
 
     Attributes:
+        trial: The start; ``known`` is what the plan was made for.
         driver: The robot.
         grasps: Its hands.
         frames: Frames of the film, where one is made.
     """
 
     def __init__(
-        self, robot: Robot, trial: Trial, plan: TaskResult, *, friction: Collection[str],
+        self, robot: Robot, trial: Trial, *, friction: Collection[str],
         settings: TwinSettings = GRASPING, seed: int | None = None, film: tuple[int, int] | None = None,
     ) -> None:  # fmt: skip
         """Put the robot and the objects where the task starts.
@@ -91,7 +92,6 @@ class Executor:
         Args:
             robot: The robot.
             trial: The start.
-            plan: The plan for ``trial.known``, with a motion.
             friction: Names of the objects that friction holds; others are welded.
             settings: Settings of the model.
             seed: Seed of the start, for the result.
@@ -99,35 +99,50 @@ class Executor:
         """
         liquid = {held.name for held in trial.real.attached} - {held.name for held in trial.known.attached}
         own = replace(settings, friction=trial.friction * settings.friction, frictionless=liquid)
-        self.robot, self.trial, self.plan, self.seed, self.film = robot, trial, plan, seed, film
+        self.robot, self.trial, self.seed, self.film = robot, trial, seed, film
         self.driver = MujocoDriver(robot, trial.real, settings=own, assumed=trial.known)
         self.grasps = Grasps(self.driver, friction)
         self.frames: Frames = []
         self._rows: list[tuple[float, Array, Array]] = []
         self._poses: dict[str, list[Array]] = {held.name: [] for held in trial.real.attached}
         self._steps: list[tuple[str, float, float]] = []
+        self._standing: dict[str, tuple[str, Array]] = {}
 
-    def run(self) -> TaskRun:
-        """Execute all steps, up to one in which the driver's guard stops the robot, and judge."""
-        driver, motion = self.driver, self.plan.trajectory
-        assert motion is not None
+    def grasp(self) -> None:
+        """Close the hands on what they hold, and let the robot come to rest."""
         self.grasps.close()
-        self._wait(SETTLING)
-        standing = self._standing()
-        driver.forget()
+        self.wait(SETTLING)
+        self._standing = self._stood()
+        self.driver.forget()
+
+    def move(self, title: str, motion: Trajectory) -> None:
+        """Follow a motion before the task, with a title for the log."""
+        begin = self.driver.time
+        self.driver.send(motion, max(begin, self.driver.end))
+        self._to(self.driver.end + SETTLING)
+        self._steps.append((title, round(begin, 4), round(self.driver.time, 4)))
+
+    def run(self, plan: TaskResult) -> TaskRun:
+        """Execute all steps, up to one in which the driver's guard stops the robot, and judge.
+
+        Args:
+            plan: The plan for ``trial.known``, with a motion.
+        """
+        driver, motion = self.driver, plan.trajectory
+        assert motion is not None
         lost = [one for one in self.grasps.found if one.kind == LOST]
-        after: list[Step | None] = [None, *self.plan.problem.after]
-        for planned, step in zip(self.plan.steps, after, strict=True):
+        after: list[Step | None] = [None, *plan.problem.after]
+        for planned, step in zip(plan.steps, after, strict=True):
             if driver.fault:
                 break
             self._follow(planned, step, motion_of(self.robot, self.trial.known, motion, planned))
-        self._wait(RESTING)
+        self.wait(RESTING)
         still = {body.name for body in (*self.trial.known.scene, *self.robot.fixtures)}
         touched = [pair for pair in self._touched() if still & set(pair)]
-        end = self.plan.steps[-1].path.states[-1]
-        judge = Judge(self.trial.known, driver, intended(self.robot, self.plan), end, standing, touched)
+        end = plan.steps[-1].path.states[-1]
+        judge = Judge(self.trial.known, driver, intended(self.robot, plan), end, self._standing, touched)
         checks = (*judge.checks(), Check("the robot follows its motion", not driver.fault, driver.fault or "it does"))
-        return self._result(checks, [f"{one.hand} did not get hold of {one.object}" for one in lost])
+        return self._result(plan, checks, [f"{one.hand} did not get hold of {one.object}" for one in lost])
 
     def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:
         driver, begin = self.driver, self.driver.time
@@ -142,7 +157,7 @@ class Executor:
             self.grasps.grasp(step.object, step.hand, self._to)
         self._steps.append((planned.title, round(begin, 4), round(driver.time, 4)))
 
-    def _standing(self) -> dict[str, tuple[str, Array]]:
+    def _stood(self) -> dict[str, tuple[str, Array]]:
         """Return what stands on what, of objects that no link may touch, liquids apart."""
         found = {}
         for one in self.trial.known.attached:
@@ -151,7 +166,8 @@ class Executor:
                 found[one.name] = below[0].name, in_link(self.driver, one.name, below[0].name)
         return found
 
-    def _wait(self, seconds: float) -> None:
+    def wait(self, seconds: float) -> None:
+        """Let time pass."""
         self._to(self.driver.time + seconds)
 
     def _to(self, until: float) -> None:
@@ -167,7 +183,7 @@ class Executor:
         if self.film is not None and driver.time * FILM_RATE >= len(self.frames):
             self.frames.append(driver.picture(self.film))
 
-    def _result(self, checks: Sequence[Check], lost: Sequence[str]) -> TaskRun:
+    def _result(self, plan: TaskResult, checks: Sequence[Check], lost: Sequence[str]) -> TaskRun:
         failed = [f"{one.name}: {one.found}" for one in checks if not one.passed]
         outcome = DROPPED if lost and failed else FAILED if failed else DONE
         reason = "; ".join([*(lost if failed else ()), *failed])
@@ -179,7 +195,7 @@ class Executor:
             "torque_use": float(np.nan_to_num(happened.torque_use[:, arms]).max()),
         }  # fmt: skip
         return TaskRun(
-            self.plan.problem.name, self.seed, outcome, reason, tuple(self.grasps.found), tuple(checks),
+            plan.problem.name, self.seed, outcome, reason, tuple(self.grasps.found), tuple(checks),
             tuple(self._steps), times, commanded, measured,
             {name: np.array(rows) for name, rows in self._poses.items()}, self._touched(), metrics,
         )  # fmt: skip

@@ -18,7 +18,7 @@ from apex_ompl.util.display import one_line
 from apex_ompl.util.files import pack_archive, path_text, suffix_of, write_atomically
 
 SUFFIXES = (".npz", ".json")
-DONE, FAILED, UNPLANNED, DROPPED = "DONE", "FAILED", "NOT_PLANNED", "NOT_HELD"
+DONE, FAILED, UNPLANNED, DROPPED, UNSEEN = "DONE", "FAILED", "NOT_PLANNED", "NOT_HELD", "NOT_SEEN"
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,8 @@ class TaskRun:
     Attributes:
         problem: Name of the problem.
         seed: Seed of the start, or None for that of the problem.
-        outcome: ``DONE``, ``FAILED``, ``NOT_HELD`` where a hand got hold of nothing, or ``NOT_PLANNED``.
+        outcome: ``DONE``, ``FAILED``, ``NOT_HELD`` where a hand got hold of nothing, ``NOT_PLANNED``, or
+            ``NOT_SEEN`` where cameras did not find what the task needs.
         reason: Why it is not done; empty where it is.
         grasps: How objects were held, in the order in which hands closed.
         checks: The conditions at the end.

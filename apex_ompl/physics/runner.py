@@ -14,7 +14,7 @@ from apex_ompl.drivers.vessels import filled
 from apex_ompl.errors import ParameterError
 from apex_ompl.physics.execution import Executor, motion_of, rehearsed
 from apex_ompl.physics.result import UNPLANNED, TaskRun
-from apex_ompl.physics.trials import Spread, Trial, draw
+from apex_ompl.physics.trials import Spread, draw
 from apex_ompl.planning.planner import MotionPlanner
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.robot import load_robot
@@ -81,39 +81,50 @@ class TaskRunner:
         """
         if seed is not None:
             check_integer(seed, "seed", 0)
+        self.executor, friction = None, self.held_by_friction()
+        trial = draw(self.robot, self.problem, seed, self.spread, self.settings.density)
+        plan = self.plan(trial.known, seed or 0, self.spread.place)
+        if not plan or plan.trajectory is None:
+            return unplanned(self.problem, seed, f"{plan.status}: {plan.reason}"), []
+        executor = self.executor = Executor(
+            self.robot, trial, friction=friction, settings=self.settings, seed=seed, film=film
+        )  # fmt: skip
+        executor.grasp()
+        return executor.run(plan), executor.frames
+
+    def held_by_friction(self) -> Collection[str]:
+        """Return the names of the objects that friction holds, of a rehearsal where they are not given."""
         if self.friction is None:
             self.friction = self._rehearsed()
-        self.executor = None
-        trial = draw(self.robot, self.problem, seed, self.spread, self.settings.density)
-        plan = self._plan(trial, seed or 0)
-        if not plan or plan.trajectory is None:
-            return unplanned(self.problem, seed, plan), []
-        executor = self.executor = Executor(
-            self.robot, trial, plan, friction=self.friction, settings=self.settings, seed=seed, film=film
-        )  # fmt: skip
-        return executor.run(), executor.frames
+        return self.friction
 
     def _rehearsed(self) -> frozenset[str]:
         """Return the names of the objects that friction holds from the start of the problem to the goal."""
         trial = draw(self.robot, self.problem, None, self.spread, self.settings.density)
         if not any(held.links is None and held.touch_links != () for held in trial.known.attached):
             return frozenset()
-        plan = self._plan(trial, 0)
+        plan = self.plan(trial.known, 0, self.spread.place)
         if not plan or plan.trajectory is None:
             return frozenset()
         motion = motion_of(self.robot, trial.known, plan.trajectory, plan.steps[0])
         return rehearsed(self.robot, trial, motion, self.settings)
 
-    def _plan(self, trial: Trial, seed: int) -> TaskResult:
-        """Plan some times, until the way to the goal is as clear as objects may be off; return the clearest plan."""
-        known, found = trial.known, list[TaskResult]()
+    def plan(self, known: Problem, seed: int, place: float) -> TaskResult:
+        """Plan some times, until the way to the goal is as clear as objects may be off; return the clearest plan.
+
+        Args:
+            known: The problem as it is known.
+            seed: Seed of the plans.
+            place: How far objects may be off [m].
+        """
+        found = list[TaskResult]()
         for k in range(PLANS):
             found.append(
                 self._planner.plan_task(
                     known, timeout=self.timeout, seed=seed + k * SEEDS, constraints=self._level(known)
                 )  # fmt: skip
             )
-            if found[-1] and found[-1].steps[0].clearance >= self.spread.place:
+            if found[-1] and found[-1].steps[0].clearance >= place:
                 break
         return max(found, key=lambda plan: plan.steps[0].clearance if plan else -1.0)
 
@@ -125,10 +136,10 @@ class TaskRunner:
         return tuple(Upright(frame=name, axis=axes[name], angle=SPILLING) for name in full)
 
 
-def unplanned(problem: Problem, seed: int | None, plan: TaskResult) -> TaskRun:
+def unplanned(problem: Problem, seed: int | None, reason: str, outcome: str = UNPLANNED) -> TaskRun:
     """Return the result of a task that was not planned."""
     nothing = np.empty((0, 0))
     return TaskRun(
-        problem.name, seed, UNPLANNED, f"{plan.status}: {plan.reason}", (), (), (), np.empty(0), nothing, nothing, {},
+        problem.name, seed, outcome, reason, (), (), (), np.empty(0), nothing, nothing, {},
         {}, {},
     )  # fmt: skip

@@ -289,3 +289,38 @@ def test_a_saved_npz_holds_the_checked_path(apex_cli, easy: Path, tmp_path: Path
     assert apex_cli("plan", easy, "--out", tmp_path / "r.npz", "--timeout", 30).returncode == 0
     with np.load(tmp_path / "r.npz") as data:
         assert data["path"].shape[1] == 16 and data["path"].dtype == np.float64
+
+
+def test_see_prints_draws_and_says_what_is_missing(apex_cli, robot, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    from apex_ompl.perception import Frame
+    from apex_ompl.perception.rig import default_cameras
+
+    camera = default_cameras(160)[0]
+    joints = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
+    blank = Frame(camera, np.full((120, 160), 3.0), np.zeros((120, 160, 3), np.uint8), 0.5, joints)
+    blank.save(tmp_path / "frame.npz")
+    done = apex_cli("see", tmp_path / "frame.npz", "-o", tmp_path / "seen.png")
+    assert done.returncode == 1 and "front: 1 frame up to 0.500 s" in done.stdout and "reason" in done.stdout
+    assert (tmp_path / "seen.png").read_bytes()[:4] == b"\x89PNG"
+    done = apex_cli("see", tmp_path / "frame.npz", "--problem", "stack_boxes", "--json")
+    told = json.loads(done.stdout)
+    assert done.returncode == 1 and told["reasons"] and [one["name"] for one in told["objects"]] == ["lower", "upper"]
+    for wrong in (
+        ("see", tmp_path / "none.npz"), ("see", tmp_path / "frame.npz", "-o", "seen.gif"),
+        ("see", tmp_path / "frame.npz", "--problem", "nowhere"), ("see", tmp_path / "seen.png"),
+    ):  # fmt: skip
+        done = apex_cli(*wrong)
+        assert done.returncode == 2 and one_sentence(done.stderr), done.stderr
+
+
+def test_cameras_of_runs_are_checked(apex_cli, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    pytest.importorskip("mujoco")
+    for wrong in (
+        ("stack_boxes", "--camera", "--cameras", tmp_path / "none.yaml"), ("stack_boxes", "--cubes", 1),
+        ("stack_boxes", "--cameras", "front.yaml"), ("shelf_swap", "--camera"),
+        ("popup/vertical/large/12", "--camera", "--cubes", 1),
+    ):  # fmt: skip
+        done = apex_cli("run", *wrong)
+        assert done.returncode == 2 and one_sentence(done.stderr), done.stderr

@@ -62,6 +62,8 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ((0, 1), "run own.yaml --driver kinematic --timeout 3"),
     ((0, 1, 2), "run own.yaml --driver mujoco --seed 1 --timeout 20 --out task.npz --json"),  # 2 without MuJoCo
     ((2,), "run own.yaml --driver mujoco --film task.gif"),
+    ((0, 1), "run interceptor/vertical/small/800000 --method no-network --camera --cameras eye.yaml --timeout 2"),
+    ((0, 1, 2, 3), "run own.yaml --camera --cubes 1 --timeout 20"),  # 2 without MuJoCo or OpenGL
     ((2,), "ros2 own.yaml --ros-args -p speed:=7.0"),  # without ROS as well as with a faulty parameter
     ((0,), "render plan.npz --out plan.png --azimuth 10"),
     ((0,), "plot plan.npz --out plan.svg"),
@@ -79,6 +81,8 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         "--robot dual_panda_softhand --out camera.yaml",
     ),
     ((0,), "calibrate others --board charuco:5x4:0.06 --camera-link left_hand_palm --out carried.yaml"),
+    ((1,), "see frames others --robot dual_panda_softhand --out seen.png --json"),  # whose frames have no depths
+    ((1,), "see frames --problem stack_boxes"),
     (
         (0,),
         "bench posts/easy --planners apex,rrtconnect --runs 1 --timeout 5 --seed 1 --split validation --no-simplify "
@@ -88,7 +92,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
 )
 WRITTEN = (
     "plan.npz", "motion.traj.yaml", "path.json", "run.npz", "real.json", "plan.png", "plan.svg", "run.png", "page.html",
-    "converted.yaml", "camera.yaml", "carried.yaml", "report/report.html", "report/report.md",
+    "converted.yaml", "camera.yaml", "carried.yaml", "seen.png", "report/report.html", "report/report.md",
 )  # fmt: skip
 
 

@@ -1,0 +1,180 @@
+"""Dynamic obstacles as cameras see them: a sensor of the closed loop.
+
+At its rate every camera draws a frame, in which obstacles of a color are found (:mod:`apex_ompl.perception.obstacles`)
+and tracked (:mod:`apex_ompl.perception.tracking`). An observation has the stamp of the frames and is received later by
+the latency. Names are the tracker's own; obstacles are larger by the margin that their covariances give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from apex_ompl.drivers.driver import Driver
+from apex_ompl.drivers.mujoco import MujocoDriver
+from apex_ompl.errors import ParameterError
+from apex_ompl.loop.environment import Environment, Observation
+from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings
+from apex_ompl.perception.registration import RegistrationSettings, corrected
+from apex_ompl.perception.rendered_camera import RenderedCamera
+from apex_ompl.perception.rig import Eye, check_cameras, default_cameras, misplaced, noisy
+from apex_ompl.perception.surfaces import RobotSurface, body_surface
+from apex_ompl.perception.tracking import ObstacleTracker, TrackedObstacle, TrackerSettings
+from apex_ompl.perception.twin_camera import TwinCamera
+from apex_ompl.robot import Robot, load_robot
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.util.display import fields_line
+from apex_ompl.util.validation import check_number, check_positive, check_seed
+
+WIDTH = 320  # of the default cameras [pixels]
+LOW, HIGH = (-0.8, -1.2, -0.05), (1.5, 1.2, 1.6)  # corners of the space beyond which no obstacle counts [m]
+SPREAD = 0.03  # by which held objects are larger, whose red pixels are no obstacle [m]
+EARLY = 1e-6  # of a frame [s]
+
+
+class CameraSensor:
+    """Observations of dynamic obstacles by cameras.
+
+    Attributes:
+        eyes: The cameras.
+        robot: The robot.
+        attached: What it holds.
+        rate: Frames a second of each camera [1/s].
+        latency: Time from a frame to its observation [s].
+        error: Largest error of the position that the margin does not hold [m].
+        named: Whether names are those of the environment.
+        tracker: The tracker.
+        tracked: What it has tracked so far.
+    """
+
+    named = False
+
+    def __init__(
+        self, eyes: Sequence[Eye], robot: Robot, attached: Sequence[AttachedObject] = (), *, rate: float = 10.0,
+        latency: float = 0.03, error: float = 0.015, obstacles: ObstacleSettings | None = None,
+        tracker: TrackerSettings | None = None, registration: RegistrationSettings | None = None,
+    ) -> None:  # fmt: skip
+        """Set up the finder and the tracker.
+
+        Raises:
+            MissingFileError: The extra ``perception`` is not installed.
+            ParameterError: There is no camera, or a number is out of its range.
+        """
+        check_positive(rate, "rate", "a positive number of frames a second")
+        check_number(latency, "latency", 0.0)
+        check_number(error, "error", 0.0)
+        if not eyes:
+            raise ParameterError("eyes", "none", "one camera or more")
+        self.eyes, self.robot, self.attached = tuple(eyes), robot, tuple(attached)
+        self.rate, self.latency, self.error = rate, latency, error
+        self._finder, self.tracker = ObstacleFinder(obstacles), ObstacleTracker(tracker)
+        self.tracked: tuple[TrackedObstacle, ...] = ()
+        self._surface, self._registration = RobotSurface(robot), registration or RegistrationSettings()
+        self._radii = [body_surface(one).radius + SPREAD for one in self.attached]
+        self._next = -np.inf
+
+    __repr__ = fields_line
+
+    def read(self, now: float) -> Observation | None:
+        """Return what the cameras see at a time [s], where it is time for a frame, else None."""
+        if now < self._next - EARLY:
+            return None
+        self._next = (now if np.isinf(self._next) else self._next) + 1.0 / self.rate
+        gone: list[str] = []
+        seen = set()
+        for eye in self.eyes:
+            frame = eye.frame()
+            given = corrected(frame, self._surface, self._registration)
+            links = [self.robot.link_pose(given.registration.state, one.link) @ one.pose for one in self.attached]
+            balls = [(pose[:3, 3], radius) for pose, radius in zip(links, self._radii, strict=True)]
+            assert frame.color is not None
+            found = self._finder.find(given, frame.color, balls)
+            self.tracked = self.tracker.update(now, found, given)
+            gone += self.tracker.gone
+            seen |= {one.name for one in self.tracked if one.observed is not None}
+        there = [one for one in self.tracked if one.name in seen]
+        low, high = np.array(self._finder.settings.low), np.array(self._finder.settings.high)
+        for one in self.tracked:
+            place = one.pose[:3, 3]
+            if one.name not in seen and not ((place > low) & (place < high)).all():
+                gone.append(one.name)
+        errors = {one.name: self.error for one in there}
+        return Observation(
+            now, now + self.latency, tuple(one.solid for one in there), errors, tuple(dict.fromkeys(gone))
+        )
+
+    def close(self) -> None:
+        """Release what draws the images."""
+        for eye in self.eyes:
+            getattr(eye, "close", tuple)()
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Simulated cameras as a sensor of a run: ``apex_ompl.run(..., driver="kinematic", sensor=Cameras())``.
+
+    A robot in physics is drawn by MuJoCo, others by the kernel's renderer. Poses and depths of the cameras are off by
+    their spreads.
+
+    Attributes:
+        cameras: The cameras, as they are reported.
+        rate: Frames a second of each camera [1/s].
+        latency: Time from a frame to its observation [s].
+        error: Largest error of the position that the margin does not hold [m].
+        obstacles: What obstacles look like.
+        tracker: Settings of the tracker.
+        rendered: Whether the kernel's renderer draws a robot in physics, too, which is faster.
+        seed: Seed of errors and noise.
+    """
+
+    cameras: tuple[Camera, ...] = field(default_factory=lambda: default_cameras(WIDTH))
+    rate: float = 10.0
+    latency: float = 0.03
+    error: float = 0.015
+    obstacles: ObstacleSettings = field(default_factory=lambda: ObstacleSettings(low=LOW, high=HIGH))
+    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    rendered: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check all.
+
+        Raises:
+            ParameterError: There is no camera, or a number is out of its range.
+        """
+        check_cameras(self.cameras)
+        check_positive(self.rate, "rate", "a positive number of frames a second")
+        check_number(self.latency, "latency", 0.0)
+        check_number(self.error, "error", 0.0)
+        check_seed(self.seed)
+
+    def __call__(self, driver: Driver, environment: Environment) -> CameraSensor:
+        """Return the sensor at work for a driver's robot in an environment.
+
+        Raises:
+            ApexError: A camera's link is unknown, a body has no surface, or an extra is not installed.
+        """
+        problem = environment.problem.still
+        robot, zero = load_robot(problem.robot), driver.time
+        eyes: list[Eye] = []
+
+        def others(time: float) -> tuple[Obstacle, ...]:
+            return environment.present(time - zero)
+
+        for k, camera in enumerate(self.cameras):
+            rng = np.random.default_rng((self.seed, k))
+            true = misplaced(camera, rng)
+            measured = noisy(true, rng)
+            if isinstance(driver, MujocoDriver) and not self.rendered:
+                eyes.append(TwinCamera(driver, true, reported=camera, measured=measured, others=others))
+            else:
+                eyes.append(
+                    RenderedCamera(driver, robot, problem, true, reported=camera, measured=measured, others=others)
+                )
+        return CameraSensor(
+            eyes, robot, problem.attached, rate=self.rate, latency=self.latency, error=self.error,
+            obstacles=self.obstacles, tracker=self.tracker,
+        )  # fmt: skip
