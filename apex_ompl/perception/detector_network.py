@@ -1,0 +1,90 @@
+"""The network of the detector of objects: convolutions down to cells of 16 pixels and up again to cells of 4."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+CHANNELS = 6  # red, green, blue, depth relative to its surroundings, depth, whether there is one
+FINE_CHANNELS = 4  # of cells: the upward direction, and depth
+SURROUNDINGS = 9  # side of the square of cells of which depths are relative to the mean
+RELIEF, FAR = 0.08, 1.3  # units of relative depth, and mean depth [m]
+
+
+class Votes(NamedTuple):
+    """What each cell says, shapes (N, C, h, w).
+
+    Attributes:
+        kinds: Logits: none, and each kind.
+        center: Center of the object from the cell's measured point, in the frame of the cell's ray [0.1 m].
+        spread: Logarithm of the mean absolute error of the center [0.1 m].
+        axis: Products of the components of the axis there: xx, yy, zz, xy, xz, yz.
+        sign: The axis, of kinds whose ends differ.
+        size: Logarithms of radius and half length over those of its kind, in units of 0.1.
+    """
+
+    kinds: Tensor
+    center: Tensor
+    spread: Tensor
+    axis: Tensor
+    sign: Tensor
+    size: Tensor
+
+
+def network_input(color: Tensor, depth: Tensor) -> Tensor:
+    """Return the input of the network, shape (N, 6, H, W).
+
+    Args:
+        color: 0 to 1, shape (N, 3, H, W).
+        depth: 0 where there is none, shape (N, 1, H, W) [m].
+    """
+    there = (depth > 0.0).to(depth.dtype)
+    small = [functional.avg_pool2d(one, 4) for one in (depth, there)]
+    total, count = (functional.avg_pool2d(one, SURROUNDINGS, 1, SURROUNDINGS // 2) for one in small)
+    mean = functional.interpolate(total / count.clamp(min=1e-3), scale_factor=4.0)
+    relief = ((depth - mean) / RELIEF).clamp(-3.0, 3.0) * there
+    return torch.cat([color - 0.5, relief, (depth - FAR) * there, there], dim=1)
+
+
+def _block(inside: int, outside: int, stride: int = 1, side: int = 3) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(inside, outside, side, stride, side // 2, bias=False), nn.BatchNorm2d(outside), nn.ReLU(inplace=True)
+    )
+
+
+class DetectorNetwork(nn.Module):
+    """Votes of cells."""
+
+    def __init__(self, kinds: int, widths: tuple[int, ...] = (16, 24, 48, 96, 32)) -> None:
+        """Make the layers.
+
+        Args:
+            kinds: Number of kinds of objects.
+            widths: Channels at a half, a fourth, an eighth and a sixteenth of the image's size, and of the last layers.
+        """
+        super().__init__()
+        a, b, c, d, e = widths
+        self.sizes = (1 + kinds, 3, 1, 6, 3, 2)
+        self.stem = _block(CHANNELS, a, 2)
+        self.fourth = nn.Sequential(_block(a, b, 2), _block(b, b))
+        self.eighth = nn.Sequential(_block(b + FINE_CHANNELS, c, 2), _block(c, c), _block(c, c))
+        self.sixteenth = nn.Sequential(_block(c, d, 2), _block(d, d), _block(d, d))
+        self.up = _block(c + d, c)
+        self.fine = nn.Sequential(_block(b + FINE_CHANNELS + c, e, side=1), _block(e, e))
+        self.head = nn.Conv2d(e, sum(self.sizes), 1)
+
+    def forward(self, image: Tensor, fine: Tensor) -> Votes:
+        """Return the votes of all cells.
+
+        Args:
+            image: Input, shape (N, 6, H, W).
+            fine: Upward direction in the frames of the cells' rays, and their depth, shape (N, 4, H / 4, W / 4).
+        """
+        fourth = torch.cat([self.fourth(self.stem(image)), fine], dim=1)
+        eighth = self.eighth(fourth)
+        sixteenth = functional.interpolate(self.sixteenth(eighth), scale_factor=2.0)
+        up = functional.interpolate(self.up(torch.cat([eighth, sixteenth], dim=1)), scale_factor=2.0)
+        return Votes(*self.head(self.fine(torch.cat([fourth, up], dim=1))).split(self.sizes, dim=1))

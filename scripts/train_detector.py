@@ -1,0 +1,303 @@
+"""Make the data of the detector of objects, train it, and write its checkpoint.
+
+Usage: python scripts/train_detector.py make [--frames N] [--folder FOLDER]; then ``train``; then ``save``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from apex_ompl.errors import MissingFileError
+from apex_ompl.perception.camera import Camera
+from apex_ompl.perception.detector import CELL, FOCAL, KINDS, OPEN, cell_rays, cells_of, in_cells, ray_frames
+from apex_ompl.perception.detector_scenes import TRAINING, ObjectScene, ObjectSceneGenerator
+from apex_ompl.perception.detector_network import DetectorNetwork, network_input
+from apex_ompl.perception.synthetic import KINDS as KIND_SIZES
+from apex_ompl.perception.synthetic import SyntheticSettings, default_camera
+from apex_ompl.problems.objects import DATA
+from apex_ompl.problems.suite_robot import robot
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import make_folder
+
+SHARD = 250  # frames of a file
+SEEDS = {"train": 7301, "validation": 7302}
+MOST = 12  # objects of a frame
+LENS = np.array([FOCAL, FOCAL, 159.5, 119.5])
+CROP = (160, 192)  # of a frame that is trained on [pixels]
+CENTERED = 0.85  # share of these around an object
+RATE = 4e-3  # largest learning rate
+EVERY = 200  # steps from one report to the next
+UNIT, FARTHEST, SIZE_UNIT = 0.1, 1.5, 0.1  # of places [m], largest one in it, of logarithms of sizes
+FIELDS = 12  # kind, held, share seen, center, axis, radius, half length, label's place
+
+
+def training_camera() -> Camera:
+    """Return a camera of 320 x 240 pixels, with the focal length that the network sees."""
+    found = default_camera(SyntheticSettings())
+    depth = found.depth.model_copy(update={"correlation": found.depth.correlation // 2})
+    lens = {"width": 320, "height": 240, "focal": (FOCAL, FOCAL), "center": (159.5, 119.5), "depth": depth}
+    return found.model_copy(update=lens)
+
+
+def packed(scene: ObjectScene) -> dict[str, np.ndarray]:
+    """Return what trainings use of a scene, all in the true optical frame."""
+    millimeters = np.round(scene.frame.depth * 1e3).astype(np.uint16)
+    cells = cells_of(millimeters.astype(float) * 1e-3)
+    labels, about = in_cells(scene.labels, cells.pixel), np.full((MOST, FIELDS), -1.0, np.float32)
+    owner = np.zeros(labels.shape, np.uint8)
+    rotation, eye = scene.camera[:3, :3], scene.camera[:3, 3]
+    for k, one in enumerate(scene.objects[:MOST]):
+        center, axis = (one.pose[:3, 3] - eye) @ rotation, one.pose[:3, 2] @ rotation
+        numbers = KINDS.index(one.kind), one.held, one.seen, *center, *axis, one.size[0], one.size[2], one.inside
+        about[k] = numbers
+        owner[labels == one.label] = k + 1
+    owner[cells.depth <= 0.0] = 255
+    return {
+        "color": scene.frame.color, "depth": millimeters, "owner": owner, "objects": about,
+        "up": rotation[2].astype(np.float32),
+    }  # fmt: skip
+
+
+def make(folder: Path, part: str, frames: int) -> None:
+    """Draw frames and write them in files of ``SHARD``; files that are there already are kept."""
+    make_folder(folder, "folder of the detector's data")
+    generator = ObjectSceneGenerator(robot(), DATA, camera=training_camera())
+    for first in range(0, frames, SHARD):
+        file = folder / f"{part}-{first // SHARD:03d}.npz"
+        if file.is_file():
+            continue
+        drawn = [
+            packed(generator.draw_objects(np.random.default_rng((SEEDS[part], k)), TRAINING))
+            for k in range(first, first + SHARD)
+        ]
+        unfinished = file.with_suffix(".part.npz")
+        np.savez_compressed(unfinished, **{name: np.stack([one[name] for one in drawn]) for name in drawn[0]})
+        unfinished.replace(file)
+        print(file.name, flush=True)
+
+
+class Data:
+    """Frames of a part in memory.
+
+    Attributes:
+        arrays: Arrays of frames by name, as :func:`packed` has them, and ``near``, the depths of cells [mm].
+    """
+
+    def __init__(self, folder: Path, part: str, most: int | None = None) -> None:
+        """Read the files of a part, the first ``most`` of them."""
+        files = sorted(folder.glob(f"{part}-[0-9][0-9][0-9].npz"))[:most]
+        if not files:
+            raise MissingFileError(str(folder), "folder of the detector's data", "expected files made by `make`")
+        read = [dict(np.load(file)) for file in files]
+        for one in read:
+            one["near"] = np.stack([cells_of(image.astype(float)).depth for image in one["depth"]]).astype(np.uint16)
+        self.arrays = {name: np.concatenate([one[name] for one in read]) for name in read[0]}
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.arrays["depth"])
+
+
+def crop(data: Data, k: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Return a part of a frame around an object, or anywhere, mirrored at random, with the rays of its cells."""
+    height, width = CROP
+    owner, objects = data.arrays["owner"][k], data.arrays["objects"][k]
+    rows, columns = (n * CELL for n in owner.shape)
+    middle = rng.uniform((0, 0), (rows, columns))
+    seen = np.unique(owner[(owner > 0) & (owner < 255)])
+    if len(seen) and rng.random() < CENTERED:
+        x, y, z = objects[rng.choice(seen) - 1, 3:6]
+        middle = np.array([FOCAL * y / z + LENS[3], FOCAL * x / z + LENS[2]]) + rng.uniform(-60.0, 60.0, 2)
+    top, left = ((middle - np.array(CROP) / 2) / CELL).clip(0, (np.array([rows, columns]) - CROP) // CELL).astype(int)
+    cells = slice(top, top + height // CELL), slice(left, left + width // CELL)
+    pixels = slice(top * CELL, top * CELL + height), slice(left * CELL, left * CELL + width)
+    found = {name: data.arrays[name][k][pixels] for name in ("color", "depth")}
+    found |= {name: data.arrays[name][k][cells] for name in ("owner", "near")}
+    found["rays"] = cell_rays(LENS, found["owner"].shape, (top * CELL, left * CELL)).astype(np.float32)
+    found |= {"objects": objects, "up": data.arrays["up"][k]}
+    return mirrored(found) if rng.random() < 0.5 else found
+
+
+def mirrored(given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the mirror image of a part of a frame."""
+    found = {name: given[name][:, ::-1] for name in ("color", "depth", "owner", "near", "rays")}
+    found |= {name: given[name].copy() for name in ("rays", "objects", "up")} | {"rays": found["rays"].copy()}
+    found["rays"][..., 0] *= -1.0
+    found["objects"][:, [3, 6]] *= -1.0
+    found["up"][0] *= -1.0
+    return found
+
+
+def whole(data: Data, k: int) -> dict[str, np.ndarray]:
+    """Return a frame with the rays of its cells."""
+    found = {name: values[k] for name, values in data.arrays.items()}
+    return found | {"rays": cell_rays(LENS, found["owner"].shape).astype(np.float32)}
+
+
+def batch(items: list[dict[str, np.ndarray]]) -> dict[str, Any]:
+    """Return tensors of input and targets of parts of frames."""
+    import torch
+
+    rays = np.stack([one["rays"] for one in items])
+    near = np.stack([one["near"] for one in items]).astype(np.float32) * 1e-3
+    owner = np.stack([one["owner"] for one in items]).astype(np.int64)
+    frames = ray_frames(rays).astype(np.float32)
+    local = frames.swapaxes(-1, -2)
+    up = np.einsum("nhwij,nj->nhwi", local, np.stack([one["up"] for one in items]))
+    there = (owner > 0) & (owner < 255)
+    table = np.stack([one["objects"] for one in items])
+    mine = table[np.arange(len(items))[:, None, None], np.where(there, owner - 1, 0)]
+    kind = np.where(there, mine[..., 0], -1.0).astype(np.int64)
+    away = np.einsum("nhwij,nhwj->nhwi", local, mine[..., 3:6] - rays * near[..., None]) / UNIT
+    axis = np.einsum("nhwij,nhwj->nhwi", local, mine[..., 6:9])
+    nominal = np.array([[KIND_SIZES[name].size[0], KIND_SIZES[name].size[2]] for name in KINDS], np.float32)
+    size = np.log(np.maximum(mine[..., 9:11], 1e-3) / nominal[kind]) / SIZE_UNIT
+    votes = there & (np.abs(away).max(axis=-1) < FARTHEST)
+    count = np.stack([np.bincount(one.ravel(), minlength=256)[one] for one in owner])
+    weight = np.where(votes, 1.0 / np.sqrt(np.maximum(count, 4)), 0.0).astype(np.float32)
+    images = np.stack([one["color"] for one in items]).transpose(0, 3, 1, 2).astype(np.float32) / 255.0
+    depths = np.stack([one["depth"] for one in items])[:, None].astype(np.float32) * 1e-3
+
+    def channels_first(values: np.ndarray) -> Any:
+        return torch.from_numpy(np.ascontiguousarray(np.moveaxis(values, -1, 1), np.float32))
+
+    return {
+        "color": torch.from_numpy(images), "depth": torch.from_numpy(depths), "kind": torch.from_numpy(kind),
+        "fine": torch.cat([channels_first(up), torch.from_numpy((near - 1.3)[:, None].astype(np.float32))], dim=1),
+        "known": torch.from_numpy(owner != 255), "weight": torch.from_numpy(weight), "away": channels_first(away),
+        "axis": channels_first(axis), "size": channels_first(size),
+    }  # fmt: skip
+
+
+def varied(color: Any, generator: Any) -> Any:
+    """Return colors, shape (N, 3, H, W), with random gain and offset; some gray, some without any content."""
+    import torch
+
+    n = len(color)
+    gain = 0.7 + 0.6 * torch.rand(n, 3, 1, 1, generator=generator)
+    offset = 0.15 * (torch.rand(n, 1, 1, 1, generator=generator) - 0.5)
+    luck = torch.rand(n, 1, 1, 1, generator=generator)
+    color = torch.where(luck < 0.1, color.mean(dim=1, keepdim=True).expand_as(color), color)
+    return torch.where(luck > 0.93, torch.full_like(color, 0.5), (color * gain + offset).clamp(0.0, 1.0))
+
+
+def losses(votes: Any, given: dict[str, Any]) -> dict[str, Any]:
+    """Return the terms of the loss."""
+    import torch
+    from torch.nn import functional
+
+    weight, kind = given["weight"], given["kind"]
+    total = weight.sum().clamp(min=1e-6)
+    logits = functional.cross_entropy(votes.kinds, kind + 1, reduction="none")
+    balance = torch.where(kind >= 0, 6.0 * weight, torch.ones_like(weight)) * given["known"]
+    off = (votes.center - given["away"]).abs().mean(dim=1)
+    spread = votes.spread[:, 0].clamp(-4.0, 1.0)
+    a = given["axis"]
+    tensor = torch.cat([a * a, a[:, [0]] * a[:, [1]], a[:, [0]] * a[:, [2]], a[:, [1]] * a[:, [2]]], dim=1)
+    long = weight * (kind != KINDS.index("ball"))
+    ends = weight * sum((kind == KINDS.index(name)) for name in OPEN)
+    return {
+        "kind": (balance * logits).sum() / balance.sum(),
+        "center": (weight * (off / spread.exp() + spread)).sum() / total,
+        "axis": (long * (votes.axis - tensor).abs().mean(dim=1)).sum() / long.sum().clamp(min=1e-6),
+        "sign": (ends * (votes.sign - a).abs().mean(dim=1)).sum() / ends.sum().clamp(min=1e-6),
+        "size": (weight * (votes.size - given["size"]).abs().mean(dim=1)).sum() / total,
+        "off": (weight * off).sum().detach() / total,
+    }  # fmt: skip
+
+
+WEIGHTS = {"kind": 2.0, "center": 1.0, "axis": 4.0, "sign": 1.0, "size": 0.3}
+"""Factors of the terms of the loss."""
+
+
+def train(folder: Path, steps: int, size: int) -> None:
+    """Train, or go on with an interrupted training."""
+    import torch
+
+    torch.set_num_threads(1)
+    data, seen = Data(folder, "train"), Data(folder, "validation", 1)
+    torch.manual_seed(0)
+    network = DetectorNetwork(len(KINDS)).to(memory_format=torch.channels_last)
+    averaged = torch.optim.swa_utils.AveragedModel(
+        network, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.998), use_buffers=True
+    )
+    optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=0.01)
+    state, step, spent = folder / "state.pt", 0, 0.0
+    if state.is_file():
+        kept = torch.load(state, weights_only=True)
+        network.load_state_dict(kept["network"])
+        averaged.load_state_dict(kept["averaged"])
+        optimizer.load_state_dict(kept["optimizer"])
+        step, spent = kept["step"], kept["spent"]
+    sums: dict[str, float] = {}
+    started = time.process_time()
+    while step < steps:
+        rng, generator = np.random.default_rng((3, step)), torch.Generator().manual_seed(step)
+        for group in optimizer.param_groups:
+            group["lr"] = RATE * min(1.0, (step + 1) / 200) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
+        given = batch([crop(data, k, rng) for k in rng.integers(len(data), size=size)])
+        image = network_input(varied(given["color"], generator), given["depth"])
+        votes = network(image.contiguous(memory_format=torch.channels_last), given["fine"])
+        terms = losses(votes, given)
+        loss = sum(WEIGHTS[name] * terms[name] for name in WEIGHTS)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 5.0)
+        optimizer.step()
+        averaged.update_parameters(network)
+        step += 1
+        for name, value in terms.items():
+            sums[name] = sums.get(name, 0.0) + float(value)
+        if step % EVERY == 0 or step == steps:
+            total = spent + time.process_time() - started
+            torch.save(
+                {"network": network.state_dict(), "averaged": averaged.state_dict(), "step": step, "spent": total,
+                 "optimizer": optimizer.state_dict(), "frames": len(data), "steps": steps}, state.with_suffix(".part")
+            )  # fmt: skip
+            state.with_suffix(".part").replace(state)
+            shown = " ".join(f"{name} {value / EVERY:.3f}" for name, value in sums.items())
+            checked = validated(averaged.module, seen)
+            print(f"{step} {total:.0f} s, {len(data)} frames: {shown} | {checked}", flush=True)
+            sums = {}
+
+
+def validated(network: Any, data: Data, frames: int = 60) -> str:
+    """Return the terms of the loss of some frames."""
+    import torch
+
+    network.eval()
+    sums: dict[str, float] = {}
+    with torch.inference_mode():
+        for k in range(0, frames, 4):
+            given = batch([whole(data, j) for j in range(k, k + 4)])
+            terms = losses(network(network_input(given["color"], given["depth"]), given["fine"]), given)
+            for name, value in terms.items():
+                sums[name] = sums.get(name, 0.0) + float(value)
+    network.train()
+    return " ".join(f"{name} {value / (frames / 4):.3f}" for name, value in sums.items())
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("step", choices=("make", "train", "save"))
+    parser.add_argument("--folder", type=Path, default=Path("data/detector"))
+    parser.add_argument("--frames", type=int, default=8000)
+    parser.add_argument("--steps", type=int, default=4000)
+    parser.add_argument("--batch", type=int, default=16)
+    given = parser.parse_args()
+    if given.step == "make":
+        make(given.folder, "validation", 500)
+        make(given.folder, "train", given.frames)
+    if given.step == "train":
+        train(given.folder, given.steps, given.batch)
+
+
+if __name__ == "__main__":
+    run_script(main)
