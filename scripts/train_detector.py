@@ -16,8 +16,8 @@ import numpy as np
 from apex_ompl.errors import MissingFileError
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.detector import CELL, FOCAL, KINDS, OPEN, cell_rays, cells_of, in_cells, ray_frames
-from apex_ompl.perception.detector_scenes import TRAINING, ObjectScene, ObjectSceneGenerator
 from apex_ompl.perception.detector_network import DetectorNetwork, network_input
+from apex_ompl.perception.detector_scenes import TRAINING, ObjectScene, ObjectSceneGenerator
 from apex_ompl.perception.synthetic import KINDS as KIND_SIZES
 from apex_ompl.perception.synthetic import SyntheticSettings, default_camera
 from apex_ompl.problems.objects import DATA

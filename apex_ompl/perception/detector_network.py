@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 CHANNELS = 6  # red, green, blue, depth relative to its surroundings, depth, whether there is one
 FINE_CHANNELS = 4  # of cells: the upward direction, and depth
@@ -49,31 +51,59 @@ def network_input(color: Tensor, depth: Tensor) -> Tensor:
     return torch.cat([color - 0.5, relief, (depth - FAR) * there, there], dim=1)
 
 
-def _block(inside: int, outside: int, stride: int = 1, side: int = 3) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Conv2d(inside, outside, side, stride, side // 2, bias=False), nn.BatchNorm2d(outside), nn.ReLU(inplace=True)
-    )
+class Block(nn.Sequential):
+    """A convolution, batch normalization in trainings, and rectification."""
+
+    def __init__(self, inside: int, outside: int, stride: int = 1, side: int = 3, *, normalized: bool) -> None:
+        """Make the layers, for numbers of channels before and after."""
+        layers: list[nn.Module] = [nn.Conv2d(inside, outside, side, stride, side // 2, bias=not normalized)]
+        if normalized:
+            layers.append(nn.BatchNorm2d(outside))
+        super().__init__(*layers, nn.ReLU(inplace=True))
+
+    def folded(self) -> tuple[Tensor, Tensor]:
+        """Return weights and bias of the convolution that does the same as it and its normalization."""
+        convolution, normalization = self[0], self[1]
+        return fuse_conv_bn_weights(
+            convolution.weight, convolution.bias, normalization.running_mean, normalization.running_var,
+            normalization.eps, normalization.weight, normalization.bias,
+        )  # fmt: skip
+
+
+def folded(network: DetectorNetwork) -> DetectorNetwork:
+    """Return a network without batch normalization that does the same as a trained one."""
+    found = DetectorNetwork(network.sizes[0] - 1, network.widths, normalized=False)
+    found.head.load_state_dict(network.head.state_dict())
+    blocks = [[one for one in each.modules() if isinstance(one, Block)] for each in (network, found)]
+    with torch.no_grad():
+        for before, after in zip(*blocks, strict=True):
+            weight, bias = before.folded()
+            after[0].weight.copy_(weight)
+            after[0].bias.copy_(bias)
+    return found.eval()
 
 
 class DetectorNetwork(nn.Module):
     """Votes of cells."""
 
-    def __init__(self, kinds: int, widths: tuple[int, ...] = (16, 24, 48, 96, 32)) -> None:
+    def __init__(self, kinds: int, widths: tuple[int, ...] = (16, 24, 48, 96, 32), *, normalized: bool = True) -> None:
         """Make the layers.
 
         Args:
             kinds: Number of kinds of objects.
             widths: Channels at a half, a fourth, an eighth and a sixteenth of the image's size, and of the last layers.
+            normalized: Whether there is batch normalization, as in trainings.
         """
         super().__init__()
+        self.widths, block = widths, partial(Block, normalized=normalized)
         a, b, c, d, e = widths
         self.sizes = (1 + kinds, 3, 1, 6, 3, 2)
-        self.stem = _block(CHANNELS, a, 2)
-        self.fourth = nn.Sequential(_block(a, b, 2), _block(b, b))
-        self.eighth = nn.Sequential(_block(b + FINE_CHANNELS, c, 2), _block(c, c), _block(c, c))
-        self.sixteenth = nn.Sequential(_block(c, d, 2), _block(d, d), _block(d, d))
-        self.up = _block(c + d, c)
-        self.fine = nn.Sequential(_block(b + FINE_CHANNELS + c, e, side=1), _block(e, e))
+        self.stem = block(CHANNELS, a, 2)
+        self.fourth = nn.Sequential(block(a, b, 2), block(b, b))
+        self.eighth = nn.Sequential(block(b + FINE_CHANNELS, c, 2), block(c, c), block(c, c))
+        self.sixteenth = nn.Sequential(block(c, d, 2), block(d, d), block(d, d))
+        self.up = block(c + d, c)
+        self.fine = nn.Sequential(block(b + FINE_CHANNELS + c, e, side=1), block(e, e))
         self.head = nn.Conv2d(e, sum(self.sizes), 1)
 
     def forward(self, image: Tensor, fine: Tensor) -> Votes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import NamedTuple
 
 import coal
@@ -19,10 +20,12 @@ from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.kernel.perception import draw_triangles
 from apex_ompl.perception.camera import Camera, look_at
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.rendering import DepthSensor, Light, Part, View, lens_of
+from apex_ompl.perception.rendering import DepthSensor, Light, Part, Renderer, View, lens_of
+from apex_ompl.perception.surfaces import Surface, geometry_surface
 from apex_ompl.perception.synthetic import (
     HELD,
     KINDS,
+    SLICES,
     SceneGenerator,
     SyntheticSettings,
     default_camera,
@@ -30,6 +33,8 @@ from apex_ompl.perception.synthetic import (
     random_error,
     solid_part,
 )
+from apex_ompl.robot.model import Robot
+from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number
 
@@ -128,6 +133,13 @@ class ObjectScene(NamedTuple):
 class ObjectSceneGenerator(SceneGenerator):
     """Draws scenes of a robot with objects in its hands and on its tables."""
 
+    def __init__(
+        self, robot: Robot, meshes: Path, renderer: Renderer | None = None, camera: Camera | None = None
+    ) -> None:
+        """Collect the robot's surface; arguments as of :class:`SceneGenerator`."""
+        super().__init__(robot, meshes, renderer, camera)
+        self._shapes: dict[str, Surface] = {}
+
     def draw_objects(self, rng: np.random.Generator, settings: ObjectSettings | None = None) -> ObjectScene:
         """Return a random scene."""
         s, errors = settings or ObjectSettings(), SyntheticSettings()
@@ -151,8 +163,8 @@ class ObjectSceneGenerator(SceneGenerator):
         parts = [part for part in self._parts(rng, true_state, reds=False) if not 3 < part.label < 10]
         parts += clutter(rng, int(rng.integers(s.clutter[0], s.clutter[1] + 1)))
         solids = [
-            solid_part(coal_geometry(body), at, label, (1.0, 1.0, 1.0))
-            for label, (_, at, _, body) in zip(labels, placed, strict=True)
+            self._part(kind, size, at, label, body)
+            for label, (kind, at, size, body) in zip(labels, placed, strict=True)
         ]
         view = self.renderer.draw([*parts, *solids], camera, pose)
         sensor = replace(s.sensor, bias=(1.0 + s.sensor.bias) * (1.0 + rng.normal(0.0, errors.scale_spread)) - 1.0)
@@ -165,9 +177,19 @@ class ObjectSceneGenerator(SceneGenerator):
         )
         return ObjectScene(Frame(camera, depth, color, 0.0, joints), objects, pose, view.labels)
 
+    def _part(self, kind: str, size: Array, at: Array, label: int, body: AttachedObject) -> Part:
+        """Return an object at a pose, its surface a scaled one of the nominal size."""
+        nominal = np.array(KINDS[kind].size)
+        if kind not in self._shapes:
+            usual = held_object(kind, nominal, body.link, -1, name=kind, meshes=self._meshes)
+            self._shapes[kind] = geometry_surface(coal_geometry(usual), kind, SLICES, 4)
+        vertices, faces = self._shapes[kind]
+        solid = coal_geometry(body) if body.mesh is None else None
+        return Part(Surface(vertices * (size / nominal), faces).at(at), label, (1.0, 1.0, 1.0), solid, at)
+
     def _free_objects(
         self, rng: np.random.Generator, settings: ObjectSettings, middle: Array, taken: list[tuple[Array, Array]]
-    ) -> list[tuple[str, Array, Array, object]]:  # fmt: skip
+    ) -> list[tuple[str, Array, Array, AttachedObject]]:  # fmt: skip
         """Return kind, pose, size and body of objects that touch none of those whose places and sizes are given."""
         palm = self.robot.hands[sorted(self.robot.hands)[0]].palm
         found = []
@@ -299,7 +321,9 @@ def textured(
     image = np.where((where > 0)[..., None], image, 0.1).clip(0.0, 1.5) ** rng.uniform(0.7, 1.4)
     if rng.random() < 0.5:
         padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
-        image = (padded[1:-1, 1:-1] * 2 + padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]) / 6
+        image = (
+            padded[1:-1, 1:-1] * 2 + padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
+        ) / 6
     noisy = image + rng.normal(0.0, rng.uniform(0.003, 0.03), image.shape)
     return np.asarray((255.0 * noisy.clip(0.0, 1.0)).round().astype(np.uint8))
 
