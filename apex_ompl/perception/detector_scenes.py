@@ -41,6 +41,7 @@ from apex_ompl.util.validation import check_number
 FREE, CLUTTER = 220, 300  # first labels
 OPEN = ("cup", "block")  # kinds whose two ends differ
 GAP = 0.01  # between free objects at least [m]
+MATCH = 0.06  # distance within which a detection is that of an object [m]
 TRIES = 20  # places of a free object
 REACH = ((-0.1, -0.85), (0.7, 0.85))  # of free objects on the tables, in x and y [m]
 AROUND = (0.35, 0.5)  # of the point below the hands, in x and y [m]
@@ -277,6 +278,23 @@ def clutter(rng: np.random.Generator, count: int) -> list[Part]:
         pose[:3, 3] = rng.uniform(-0.3, 0.8), rng.uniform(-1.0, 1.0), rng.uniform(-0.02, 0.1)
         parts.append(solid_part(shapes[rng.integers(len(shapes))], pose, CLUTTER + k, (1.0, 1.0, 1.0)))
     return parts
+
+
+def matched(objects: Sequence[SceneObject], centers: Sequence[Array], within: float = MATCH) -> list[int | None]:
+    """Return for each detection, the best one first, the object nearest to it that none before it took, or None.
+
+    Args:
+        objects: The objects.
+        centers: Centers of the detections in the world, each of shape (3,) [m].
+        within: Largest distance [m].
+    """
+    free, found = set(range(len(objects))), []
+    for center in centers:
+        away = {k: float(np.linalg.norm(objects[k].pose[:3, 3] - center)) for k in sorted(free)}
+        best = min(away, key=away.__getitem__, default=None)
+        found.append(best if best is not None and away[best] < within else None)
+        free.discard(-1 if found[-1] is None else found[-1])
+    return found
 
 
 def textured(
