@@ -391,31 +391,30 @@ def card(config: DetectorConfig, weights: int, found: dict[str, list[list[float]
         f"| {kind} | {len(found[kind])} | {s.across:g} | {s.along:g} | {s.turn:g} | {s.size[0]:g} | {s.size[1]:g} |"
         for kind, s in config.spreads.items()
     ]
-    return "\n".join(
-        [
-            "# A detector of objects",
-            "",
-            f"{weights / 1e3:.0f} thousand weights of 16 bits: convolutions on color and depth, whose cells of 4 x 4 pixels "
-            f"vote for centers, axes, sizes and kinds ({', '.join(config.kinds)}).",
-            "",
-            f"Trained by `scripts/train_detector.py` at commit {t['commit']} on {t['frames']} rendered frames of 320 x 240 "
-            f"pixels (seeds {SEEDS['train']} and index; validation {SEEDS['validation']}), step {t['step']} of {t['steps']}, "
-            f"{t['seconds'] / 60:.0f} min of one core on {t['hardware']}. Frames are drawn by the kernel's own renderer, "
-            "with random light, textures, gain, clutter and cameras, of a robot with two hands and objects in them, on its "
-            "tables and in the air. No frame was real.",
-            "",
-            "Errors on validation frames, as standard deviations over what votes expect (center across and along the ray; "
-            "axis), and of logarithms of sizes:",
-            "",
-            "| kind | objects | across | along | axis | radius | half length |",
-            "| --- | --- | --- | --- | --- | --- | --- |",
-            *rows,
-            "",
-            "Errors on test frames of two renderers are in `benchmarks/results/perception_detector.md`. "
-            "`apex_ompl.perception.ObjectDetector` reads it.",
-            "",
-        ]
-    )
+    lines = [
+        "# A detector of objects",
+        "",
+        f"{weights / 1e3:.0f} thousand weights of 16 bits: convolutions on color and depth, whose cells of 4 x 4 "
+        f"pixels vote for centers, axes, sizes and kinds ({', '.join(config.kinds)}).",
+        "",
+        f"Trained by `scripts/train_detector.py` at commit {t['commit']} on {t['frames']} rendered frames of 320 x 240 "
+        f"pixels (seeds {SEEDS['train']} and index; validation {SEEDS['validation']}), step {t['step']} of "
+        f"{t['steps']}, {t['seconds'] / 60:.0f} min of one core on {t['hardware']}. Frames are drawn by the kernel's "
+        "own renderer, with random light, textures, gain, clutter and cameras, of a robot with two hands and objects "
+        "in them, on its tables and in the air. No frame was real.",
+        "",
+        "Errors on validation frames, as standard deviations over what votes expect (center across and along the ray; "
+        "axis), and of logarithms of sizes:",
+        "",
+        "| kind | objects | across | along | axis | radius | half length |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+        *rows,
+        "",
+        "Errors on test frames of two renderers are in `benchmarks/results/perception_detector.md`. "
+        "`apex_ompl.perception.ObjectDetector` reads it.",
+        "",
+    ]
+    return "\n".join(lines)
 
 
 def main() -> None:

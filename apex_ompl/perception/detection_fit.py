@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.perception import Window, draw_triangles
-from apex_ompl.perception.detector import KINDS, DetectedObject
+from apex_ompl.perception.detector import KINDS, OPEN, DetectedObject
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.held import Expected, HeldObject, HeldObjectFinder, HeldSettings, window_around
 from apex_ompl.perception.registration import CorrectedFrame, corrected
@@ -27,6 +28,7 @@ PLACE_SPREAD = 0.012  # of the center of a detection; points are looked for up t
 TURNS = (0.0, 30.0, 60.0)  # about the axis, from which fits start [degrees]
 SLACK = 0.004  # distance from a support within which points are its own, beside the noise [m]
 LEAST_SLOPE = 0.1  # cosine of the angle of a ray with a support's normal, from which on the distance is that
+NEAR = 0.15  # distance of a detection from where an object is expected [m]
 AWAY = 50.0  # depth that is put in place of a support's [m]
 
 
@@ -118,6 +120,45 @@ class DetectionFit:
             slope = np.abs(mine[..., 0] * rays[..., 0] + mine[..., 1] * rays[..., 1] + mine[..., 2])
             allowed = SLACK / np.maximum(slope, LEAST_SLOPE) + 2.0 * seen.noise * part * part
             part[(index >= 0) & (part > 0.0) & (part > drawn - allowed)] = AWAY
+
+
+def nearest(found: Sequence[DetectedObject], kind: str, one: Expected, within: float = NEAR) -> DetectedObject | None:
+    """Return the detection of a kind that is nearest to where an object is expected, or None.
+
+    Args:
+        found: Detections.
+        kind: The kind.
+        one: The object.
+        within: Largest distance of the centers [m].
+    """
+    away = [(float(np.linalg.norm(it.center - one.pose[:3, 3])), it) for it in found if it.kind == kind]
+    best = min(away, key=lambda item: item[0], default=None)
+    return best[1] if best is not None and best[0] < within else None
+
+
+def fused(one: Expected, found: DetectedObject) -> Expected:
+    """Return what is expected of a held object from its grasp and a detection, each by its covariance.
+
+    Of kinds whose ends are the same the axis is taken the way that agrees with the grasp.
+    """
+    expected, axis = one.pose[:3, 2], found.axis
+    if found.kind not in OPEN and axis @ expected < 0.0:
+        axis = -axis
+    off = np.zeros(6)
+    off[3:] = found.center - one.pose[:3, 3]
+    measured = np.linalg.inv(found.covariance)
+    if found.kind == "ball":
+        measured[:3, :3] = 0.0
+    else:
+        across = np.cross(expected, axis)
+        sine = float(np.linalg.norm(across))
+        off[:3] = across / max(sine, 1e-9) * np.arctan2(sine, expected @ axis)
+    covariance = np.linalg.inv(np.linalg.inv(one.covariance) + measured)
+    step = covariance @ (measured @ off)
+    pose = one.pose.copy()
+    pose[:3, :3] = pin.exp3(step[:3]) @ pose[:3, :3]
+    pose[:3, 3] += step[3:]
+    return one._replace(pose=pose, covariance=covariance)
 
 
 def _on_link(kind: str, body: Body, link: str) -> AttachedObject:

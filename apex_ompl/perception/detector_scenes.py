@@ -123,12 +123,14 @@ class ObjectScene(NamedTuple):
         objects: All objects.
         camera: True pose of the camera in the world, shape (4, 4) [m].
         labels: Labels of what is seen, shape (height, width).
+        reported: The objects of the hands as the robot believes to hold them, in the order of ``objects``.
     """
 
     frame: Frame
     objects: tuple[SceneObject, ...]
     camera: Array
     labels: Indices
+    reported: tuple[AttachedObject, ...]
 
 
 class ObjectSceneGenerator(SceneGenerator):
@@ -170,13 +172,15 @@ class ObjectSceneGenerator(SceneGenerator):
         view = self.renderer.draw([*parts, *solids], camera, pose)
         sensor = replace(s.sensor, bias=(1.0 + s.sensor.bias) * (1.0 + rng.normal(0.0, errors.scale_spread)) - 1.0)
         depth = sensor.measure(view, camera, rng, labels)[0]
-        color = textured(view, [*parts, *solids], camera, pose, rng, s.textures)
+        color = textured(view, [*parts, *solids], camera, pose, rng, textures=s.textures)
         joints = dict(zip(self.robot.joint_names, state.tolist(), strict=True))
         objects = tuple(
-            self._seen(kind, label, at, size, label < FREE, part, view, camera, pose)
-            for label, part, (kind, at, size, _) in zip(labels, solids, placed, strict=True)
+            self._seen(kind, size, part, view, camera, pose=pose)
+            for part, (kind, _, size, _) in zip(solids, placed, strict=True)
         )
-        return ObjectScene(Frame(camera, depth, color, 0.0, joints), objects, pose, view.labels)
+        return ObjectScene(
+            Frame(camera, depth, color, 0.0, joints), objects, pose, view.labels, tuple(one[3] for one in held)
+        )
 
     def _part(self, kind: str, size: Array, at: Array, label: int, body: AttachedObject) -> Part:
         """Return an object at a pose, its surface a scaled one of the nominal size."""
@@ -223,8 +227,9 @@ class ObjectSceneGenerator(SceneGenerator):
 
     @staticmethod
     def _seen(
-        kind: str, label: int, at: Array, size: Array, held: bool, part: Part, view: View, camera: Camera, pose: Array
+        kind: str, size: Array, part: Part, view: View, camera: Camera, *, pose: Array
     ) -> SceneObject:  # fmt: skip
+        at, label = part.pose, part.label
         center = (at[:3, 3] - pose[:3, 3]) @ pose[:3, :3]
         (column, row), edge = camera.project(center), 25.0 * camera.width / 640.0
         inside = edge < column < camera.width - edge and edge < row < camera.height - edge
@@ -232,7 +237,7 @@ class ObjectSceneGenerator(SceneGenerator):
         surface = (part.surface.vertices - pose[:3, 3]) @ pose[:3, :3]
         alone = draw_triangles(surface, part.surface.faces, lens_of(camera), camera.height, camera.width)[1]
         share = float(own / max(1, np.count_nonzero(alone >= 0)))
-        return SceneObject(kind, label, at, size, held, share, bool(inside))
+        return SceneObject(kind, label, at, size, label < FREE, share, bool(inside))
 
 
 def free_pose(rng: np.random.Generator, kind: str, size: Array, middle: Array, settings: ObjectSettings) -> Array:
@@ -298,7 +303,7 @@ def matched(objects: Sequence[SceneObject], centers: Sequence[Array], within: fl
 
 
 def textured(
-    view: View, parts: Sequence[Part], camera: Camera, pose: Array, rng: np.random.Generator, textures: float
+    view: View, parts: Sequence[Part], camera: Camera, pose: Array, rng: np.random.Generator, *, textures: float
 ) -> NDArray[np.uint8]:  # fmt: skip
     """Return a color image with random colors, patterns, highlights, blur and noise, shape (height, width, 3).
 
