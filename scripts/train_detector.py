@@ -36,7 +36,7 @@ from apex_ompl.perception.detector import (
     in_cells,
     ray_frames,
 )
-from apex_ompl.perception.detector_network import DetectorNetwork, folded, network_input
+from apex_ompl.perception.detector_network import DetectorNetwork, Votes, folded, network_input
 from apex_ompl.perception.detector_scenes import TRAINING, ObjectScene, ObjectSceneGenerator, SceneObject, matched
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.synthetic import SyntheticSettings, default_camera
@@ -56,7 +56,7 @@ LENS = np.array([FOCAL, FOCAL, 159.5, 119.5])
 CROP = (160, 192)  # of a frame that is trained on [pixels]
 CENTERED = 0.85  # share of these around an object
 RATE = 4e-3  # largest learning rate
-EVERY = 200  # steps from one report to the next
+EVERY = 100  # steps from one report to the next
 UNIT, FARTHEST, SIZE_UNIT = 0.1, 1.5, 0.1  # of places [m], largest one in it, of logarithms of sizes
 FIELDS = 12  # kind, held, share seen, center, axis, radius, half length, label's place
 
@@ -265,9 +265,10 @@ def train(folder: Path, steps: int, size: int) -> None:
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1.0, (step + 1) / 200) * (0.5 + 0.5 * math.cos(math.pi * step / steps)) + 1e-5
         given = batch([crop(data, k, rng) for k in rng.integers(len(data), size=size)])
-        image = network_input(varied(given["color"], generator), given["depth"])
-        votes = network(image.contiguous(memory_format=torch.channels_last), given["fine"])
-        terms = losses(votes, given)
+        with torch.autocast("cpu", torch.bfloat16):
+            image = network_input(varied(given["color"], generator), given["depth"])
+            votes = network(image.contiguous(memory_format=torch.channels_last), given["fine"])
+        terms = losses(Votes(*(part.float() for part in votes)), given)
         loss = sum(WEIGHTS[name] * terms[name] for name in WEIGHTS)
         optimizer.zero_grad()
         loss.backward()
@@ -276,7 +277,7 @@ def train(folder: Path, steps: int, size: int) -> None:
         averaged.update_parameters(network)
         step += 1
         for name, value in terms.items():
-            sums[name] = sums.get(name, 0.0) + float(value)
+            sums[name] = sums.get(name, 0.0) + value.item()
         if step % EVERY == 0 or step == steps:
             total = spent + time.process_time() - started
             torch.save(
@@ -290,7 +291,7 @@ def train(folder: Path, steps: int, size: int) -> None:
             sums = {}
 
 
-def validated(network: Any, data: Data, frames: int = 60) -> str:
+def validated(network: Any, data: Data, frames: int = 24) -> str:
     """Return the terms of the loss of some frames."""
     import torch
 
@@ -301,7 +302,7 @@ def validated(network: Any, data: Data, frames: int = 60) -> str:
             given = batch([whole(data, j) for j in range(k, k + 4)])
             terms = losses(network(network_input(given["color"], given["depth"]), given["fine"]), given)
             for name, value in terms.items():
-                sums[name] = sums.get(name, 0.0) + float(value)
+                sums[name] = sums.get(name, 0.0) + value.item()
     network.train()
     return " ".join(f"{name} {value / (frames / 4):.3f}" for name, value in sums.items())
 

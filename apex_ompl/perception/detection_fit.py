@@ -109,7 +109,7 @@ class DetectionFit:
         rows = slice(window.top, window.top + window.height * window.stride)
         columns = slice(window.left, window.left + window.width * window.stride)
         part, rays = depth[rows, columns], seen.camera.grid[rows, columns]
-        lens = Window(window.left, window.top, *part.shape[::-1], 1).lens(lens_of(seen.camera))
+        lens = Window(window.left, window.top, part.shape[1], part.shape[0], 1).lens(lens_of(seen.camera))
         for surface in self._supports:
             vertices, faces = surface.at(inverse(seen.registration.pose))
             drawn, index = draw_triangles(vertices, faces, lens, *part.shape)

@@ -303,7 +303,8 @@ class ObjectDetector:
         import torch
 
         self.config, self.settings = config, settings or DetectorSettings()
-        self._network = network.eval().requires_grad_(False).to(memory_format=torch.channels_last)
+        ready: Any = network.eval().requires_grad_(False)
+        self._network = ready.to(memory_format=torch.channels_last)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str] | None = None, settings: DetectorSettings | None = None) -> Self:

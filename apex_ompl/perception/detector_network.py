@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.nn.utils.fusion import fuse_conv_bn_weights
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 CHANNELS = 6  # red, green, blue, depth relative to its surroundings, depth, whether there is one
 FINE_CHANNELS = 4  # of cells: the upward direction, and depth
@@ -61,25 +61,18 @@ class Block(nn.Sequential):
             layers.append(nn.BatchNorm2d(outside))
         super().__init__(*layers, nn.ReLU(inplace=True))
 
-    def folded(self) -> tuple[Tensor, Tensor]:
-        """Return weights and bias of the convolution that does the same as it and its normalization."""
-        convolution, normalization = self[0], self[1]
-        return fuse_conv_bn_weights(
-            convolution.weight, convolution.bias, normalization.running_mean, normalization.running_var,
-            normalization.eps, normalization.weight, normalization.bias,
-        )  # fmt: skip
+    def folded(self) -> nn.Conv2d:
+        """Return a convolution that does the same as it and its normalization, as trained."""
+        return fuse_conv_bn_eval(cast(nn.Conv2d, self[0]), cast(nn.BatchNorm2d, self[1]))
 
 
 def folded(network: DetectorNetwork) -> DetectorNetwork:
     """Return a network without batch normalization that does the same as a trained one."""
     found = DetectorNetwork(network.sizes[0] - 1, network.widths, normalized=False)
     found.head.load_state_dict(network.head.state_dict())
-    blocks = [[one for one in each.modules() if isinstance(one, Block)] for each in (network, found)]
-    with torch.no_grad():
-        for before, after in zip(*blocks, strict=True):
-            weight, bias = before.folded()
-            after[0].weight.copy_(weight)
-            after[0].bias.copy_(bias)
+    blocks = [[one for one in each.modules() if isinstance(one, Block)] for each in (network.eval(), found)]
+    for before, after in zip(*blocks, strict=True):
+        after[0].load_state_dict(before.folded().state_dict())
     return found.eval()
 
 

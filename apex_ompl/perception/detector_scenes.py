@@ -233,10 +233,10 @@ class ObjectSceneGenerator(SceneGenerator):
         center = (at[:3, 3] - pose[:3, 3]) @ pose[:3, :3]
         (column, row), edge = camera.project(center), 25.0 * camera.width / 640.0
         inside = edge < column < camera.width - edge and edge < row < camera.height - edge
-        own = np.count_nonzero(view.labels == label)
+        own = int(np.count_nonzero(view.labels == label))
         surface = (part.surface.vertices - pose[:3, 3]) @ pose[:3, :3]
         alone = draw_triangles(surface, part.surface.faces, lens_of(camera), camera.height, camera.width)[1]
-        share = float(own / max(1, np.count_nonzero(alone >= 0)))
+        share = own / max(1, int(np.count_nonzero(alone >= 0)))
         return SceneObject(kind, label, at, size, label < FREE, share, bool(inside))
 
 
