@@ -297,14 +297,15 @@ def validated(network: Any, data: Data, frames: int = 24) -> str:
 
     network.eval()
     sums: dict[str, float] = {}
+    count = min(frames, len(data))
     with torch.inference_mode():
-        for k in range(0, frames, 4):
-            given = batch([whole(data, j) for j in range(k, k + 4)])
+        for k in range(count):
+            given = batch([whole(data, k)])
             terms = losses(network(network_input(given["color"], given["depth"]), given["fine"]), given)
             for name, value in terms.items():
                 sums[name] = sums.get(name, 0.0) + value.item()
     network.train()
-    return " ".join(f"{name} {value / (frames / 4):.3f}" for name, value in sums.items())
+    return " ".join(f"{name} {value / count:.3f}" for name, value in sums.items())
 
 
 def frames_of(data: Data) -> Iterator[tuple[Frame, tuple[SceneObject, ...]]]:
