@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
@@ -20,7 +21,7 @@ from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.kernel.perception import draw_triangles
 from apex_ompl.perception.camera import Camera, look_at
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.rendering import DepthSensor, Light, Part, Renderer, View, lens_of
+from apex_ompl.perception.rendering import DepthSensor, Light, Mujoco, Part, Renderer, View, lens_of
 from apex_ompl.perception.surfaces import Surface, geometry_surface
 from apex_ompl.perception.synthetic import (
     HELD,
@@ -169,10 +170,14 @@ class ObjectSceneGenerator(SceneGenerator):
             self._part(kind, size, at, label, body)
             for label, (kind, at, size, body) in zip(labels, placed, strict=True)
         ]
-        view = self.renderer.draw([*parts, *solids], camera, pose)
+        lit, everything = None, [*parts, *solids]
+        if isinstance(self.renderer, Mujoco):
+            view, lit = self.renderer.draw_lit(everything, camera, pose, partial(dress, rng=rng.spawn(1)[0]))
+        else:
+            view = self.renderer.draw(everything, camera, pose)
         sensor = replace(s.sensor, bias=(1.0 + s.sensor.bias) * (1.0 + rng.normal(0.0, errors.scale_spread)) - 1.0)
         depth = sensor.measure(view, camera, rng, labels)[0]
-        color = textured(view, [*parts, *solids], camera, pose, rng, textures=s.textures)
+        color = textured(view, everything, camera, pose, rng, textures=s.textures) if lit is None else lit
         joints = dict(zip(self.robot.joint_names, state.tolist(), strict=True))
         objects = tuple(
             self._seen(kind, size, part, view, camera, pose=pose)
@@ -349,6 +354,34 @@ def textured(
         ) / 6
     noisy = image + rng.normal(0.0, rng.uniform(0.003, 0.03), image.shape)
     return np.asarray((255.0 * noisy.clip(0.0, 1.0)).round().astype(np.uint8))
+
+
+def dress(library: Any, spec: Any, rng: np.random.Generator) -> None:
+    """Add random lights that cast shadows, and materials of all geoms, to a scene of MuJoCo."""
+    head = spec.visual.headlight
+    head.ambient, head.diffuse, head.specular = np.full(3, rng.uniform(0.15, 0.45)), np.full(3, 0.25), np.zeros(3)
+    spec.visual.quality.shadowsize = 1024
+    for _ in range(rng.integers(1, 3)):
+        light = spec.worldbody.add_light(pos=rng.uniform((-1.0, -2.0, 1.5), (2.5, 2.0, 3.0)))
+        light.type, light.castshadow = library.mjtLightType.mjLIGHT_DIRECTIONAL, True
+        light.dir = np.array([0.3, 0.0, 0.2]) - light.pos
+        light.diffuse = rng.uniform(0.3, 0.7) * rng.uniform(0.85, 1.0, 3)
+    builtin = library.mjtBuiltin
+    for k, geom in enumerate(list(spec.geoms)):
+        first, second = rng.uniform(0.05, 0.95, (2, 3))
+        made = (builtin.mjBUILTIN_CHECKER, builtin.mjBUILTIN_GRADIENT, builtin.mjBUILTIN_FLAT)[rng.integers(3)]
+        spec.add_texture(
+            name=f"t{k}",
+            type=library.mjtTexture.mjTEXTURE_CUBE,
+            builtin=made,
+            rgb1=first,
+            rgb2=second,
+            width=64,
+            height=64,
+        )
+        material = spec.add_material(name=f"m{k}", specular=rng.uniform(0.0, 0.8), shininess=rng.uniform(0.0, 0.9))
+        material.textures[library.mjtTextureRole.mjTEXROLE_RGB] = f"t{k}"
+        geom.material = f"m{k}"
 
 
 def _unit(vector: Array) -> Array:
