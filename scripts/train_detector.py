@@ -426,7 +426,7 @@ def main() -> None:
     steps += "save: write the checkpoint, with spreads from the validation frames (a minute)"
     parser.add_argument("step", choices=("make", "train", "save"), help=steps)
     parser.add_argument(
-        "--folder", type=Path, default=Path("data/detector"), help="of data and training (default: %(default)s)"
+        "--folder", type=Path, default=Path("runs/detector"), help="of data and training (default: %(default)s)"
     )
     parser.add_argument("--frames", type=int, default=5000, help="to draw for the training (default: %(default)s)")
     parser.add_argument("--steps", type=int, default=4000, help="of the training (default: %(default)s)")
