@@ -217,8 +217,10 @@ def losses(votes: Any, given: dict[str, Any]) -> dict[str, Any]:
 
     weight, kind = given["weight"], given["kind"]
     total = weight.sum().clamp(min=1e-6)
-    logits = functional.cross_entropy(votes.kinds, kind + 1, reduction="none")
+    there = torch.logsumexp(votes.kinds[:, 1:], dim=1) - votes.kinds[:, 0]
+    found = functional.binary_cross_entropy_with_logits(there, (kind >= 0).float(), reduction="none")
     balance = torch.where(kind >= 0, 6.0 * weight, torch.ones_like(weight)) * given["known"]
+    named = functional.cross_entropy(votes.kinds[:, 1:], kind.clamp(min=0), reduction="none")
     off = (votes.center - given["away"]).abs().mean(dim=1)
     spread = votes.spread[:, 0].clamp(-4.0, 1.0)
     a = given["axis"]
@@ -226,7 +228,8 @@ def losses(votes: Any, given: dict[str, Any]) -> dict[str, Any]:
     long = weight * (kind != KINDS.index("ball"))
     ends = weight * sum((kind == KINDS.index(name)) for name in OPEN)
     return {
-        "kind": (balance * logits).sum() / balance.sum(),
+        "object": (balance * found).sum() / balance.sum(),
+        "kind": (weight * named).sum() / total,
         "center": (weight * (off / spread.exp() + spread)).sum() / total,
         "axis": (long * (votes.axis - tensor).abs().mean(dim=1)).sum() / long.sum().clamp(min=1e-6),
         "sign": (ends * (votes.sign - a).abs().mean(dim=1)).sum() / ends.sum().clamp(min=1e-6),
@@ -235,7 +238,7 @@ def losses(votes: Any, given: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-WEIGHTS = {"kind": 2.0, "center": 1.0, "axis": 4.0, "sign": 1.0, "size": 0.3}
+WEIGHTS = {"object": 2.0, "kind": 1.0, "center": 1.0, "axis": 8.0, "sign": 2.0, "size": 0.2}
 """Factors of the terms of the loss."""
 
 
