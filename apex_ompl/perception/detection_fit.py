@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.perception import Window, draw_triangles
-from apex_ompl.perception.detector import KINDS, OPEN, DetectedObject
+from apex_ompl.perception.detector import KINDS, KNOWN_TURN, OPEN, DetectedObject
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.held import Expected, HeldObject, HeldObjectFinder, HeldSettings, window_around
 from apex_ompl.perception.registration import CorrectedFrame, corrected
@@ -25,7 +25,10 @@ from apex_ompl.scene.bodies import AttachedObject, Body
 from apex_ompl.types import Array
 
 PLACE_SPREAD = 0.012  # of the center of a detection; points are looked for up to 2.5 times that farther out [m]
-TURNS = (0.0, 30.0, 60.0)  # about the axis, from which fits start [degrees]
+TURNS = (0.0, 30.0, -30.0)  # from which fits start: of square bodies about the axis, of round ones tilted [degrees]
+TILT = 0.05  # by which the standard deviation of the tilt along the ray is larger than that across it [rad]
+STILL = 0.01  # standard deviation of turns of round bodies about their axes, while they are fitted [rad]
+ROUND = ("can", "cup", "peg")
 SLACK = 0.004  # distance from a support within which points are its own, beside the noise [m]
 LEAST_SLOPE = 0.1  # cosine of the angle of a ray with a support's normal, from which on the distance is that
 NEAR = 0.15  # distance of a detection from where an object is expected [m]
@@ -87,10 +90,10 @@ class DetectionFit:
         """Return the same for a frame that is corrected already."""
         pose = seen.registration.pose
         moved = pose @ inverse(seen.camera.pose_at(self.robot, seen.registration.state))
+        chosen = [one for one in found if one.kind in self._templates]
         expected = [
-            self._templates[one.kind]._replace(pose=moved @ one.pose, covariance=one.covariance)
-            for one in found
-            if one.kind in self._templates
+            self._templates[one.kind]._replace(pose=moved @ one.pose, covariance=_spread(one, pose[:3, 3]))
+            for one in chosen
         ]
         depth = seen.depth.copy()
         for item in expected:
@@ -98,7 +101,8 @@ class DetectionFit:
             window = window_around(center, self._radius(item), seen.camera)
             if window is not None:
                 self._remove_supports(depth, window, seen)
-        return self._finder.find_expected(seen._replace(depth=depth), expected)
+        fitted = self._finder.find_expected(seen._replace(depth=depth), expected)
+        return tuple(_as_detected(it, one) for it, one in zip(fitted, chosen, strict=True))
 
     def _radius(self, one: Expected) -> float:
         s = self.settings
@@ -120,6 +124,30 @@ class DetectionFit:
             slope = np.abs(mine[..., 0] * rays[..., 0] + mine[..., 1] * rays[..., 1] + mine[..., 2])
             allowed = SLACK / np.maximum(slope, LEAST_SLOPE) + 2.0 * seen.noise * part * part
             part[(index >= 0) & (part > 0.0) & (part > drawn - allowed)] = AWAY
+
+
+def _spread(one: DetectedObject, eye: Array) -> Array:
+    """Return the covariance of a detection, by which the starts of a round body are tilted along the ray."""
+    if one.kind not in ROUND:
+        return one.covariance
+    ray, axis = one.center - eye, one.axis
+    values, vectors = np.linalg.eigh(one.covariance[:3, :3])
+    across = np.cross(ray, axis)
+    length = float(np.linalg.norm(across))
+    across = across / length if length > 1e-3 * float(np.linalg.norm(ray)) else vectors[:, 0]
+    found = one.covariance.copy()
+    found[:3, :3] = values[0] * (np.eye(3) - np.outer(axis, axis)) + STILL**2 * np.outer(axis, axis)
+    found[:3, :3] += TILT**2 * np.outer(across, across)
+    return found
+
+
+def _as_detected(found: HeldObject, one: DetectedObject) -> HeldObject:
+    """Return a fitted object, of a round one with an unknown turn about its axis."""
+    if one.kind not in ROUND or found.reason:
+        return found
+    covariance = found.covariance.copy()
+    covariance[:3, :3] += KNOWN_TURN**2 * np.outer(found.pose[:3, 2], found.pose[:3, 2])
+    return replace(found, covariance=covariance)
 
 
 def nearest(found: Sequence[DetectedObject], kind: str, one: Expected, within: float = NEAR) -> DetectedObject | None:
