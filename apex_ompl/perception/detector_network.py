@@ -11,9 +11,11 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 CHANNELS = 6  # red, green, blue, depth relative to its surroundings, depth, whether there is one
-FINE_CHANNELS = 4  # of cells: the upward direction, and depth
+FINE_CHANNELS = 12  # of cells: the upward direction, depth, and differences of depth to 8 other cells
+NEIGHBORS = ((0, 1), (0, -1), (1, 0), (-1, 0), (0, 2), (0, -2), (2, 0), (-2, 0))  # rows and columns to them
+STEP = 0.05  # unit of these differences [m]
 SURROUNDINGS = 9  # side of the square of cells of which depths are relative to the mean
-RELIEF, FAR = 0.08, 1.3  # units of relative depth, and mean depth [m]
+RELIEF, FAR, NEAREST = 0.08, 1.3, 0.05  # unit of relative depth, mean depth, and least one [m]
 
 
 class Votes(NamedTuple):
@@ -49,6 +51,17 @@ def network_input(color: Tensor, depth: Tensor) -> Tensor:
     mean = functional.interpolate(total / count.clamp(min=1e-3), scale_factor=4.0)
     relief = ((depth - mean) / RELIEF).clamp(-3.0, 3.0) * there
     return torch.cat([color - 0.5, relief, (depth - FAR) * there, there], dim=1)
+
+
+def with_neighbors(fine: Tensor) -> Tensor:
+    """Return the input of cells, shape (N, 4, h, w), with differences of depth to others, 0 where one has none."""
+    depth = fine[:, 3:] + FAR
+    height, width = depth.shape[2:]
+    padded = functional.pad(depth, (2, 2, 2, 2))
+    others = [padded[:, :, 2 + i : 2 + i + height, 2 + j : 2 + j + width] for i, j in NEIGHBORS]
+    there = depth > NEAREST
+    away = [((one - depth) / STEP).clamp(-2.0, 2.0) * (there & (one > NEAREST)) for one in others]
+    return torch.cat([fine, *away], dim=1)
 
 
 class Block(nn.Sequential):
@@ -106,7 +119,7 @@ class DetectorNetwork(nn.Module):
             image: Input, shape (N, 6, H, W).
             fine: Upward direction in the frames of the cells' rays, and their depth, shape (N, 4, H / 4, W / 4).
         """
-        fourth = torch.cat([self.fourth(self.stem(image)), fine], dim=1)
+        fourth = torch.cat([self.fourth(self.stem(image)), with_neighbors(fine)], dim=1)
         eighth = self.eighth(fourth)
         sixteenth = functional.interpolate(self.sixteenth(eighth), scale_factor=2.0)
         up = functional.interpolate(self.up(torch.cat([eighth, sixteenth], dim=1)), scale_factor=2.0)
