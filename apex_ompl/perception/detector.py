@@ -159,6 +159,7 @@ class DetectorConfig(StrictModel):
         kinds: Kinds of objects.
         widths: Channels of the network's layers.
         spreads: Errors by kind.
+        least_score: Score with the best mean of precision and recall on validation frames (F1).
         digest: SHA-256 of the file of weights.
         trained: Record of the training.
     """
@@ -167,6 +168,7 @@ class DetectorConfig(StrictModel):
     kinds: tuple[Literal["box", "can", "cup", "ball", "block", "peg"], ...]
     widths: Annotated[tuple[Annotated[int, Field(gt=0, le=256)], ...], Field(min_length=5, max_length=5)]
     spreads: dict[str, KindSpread]
+    least_score: Annotated[float, Field(ge=0.0, le=1.0)]
     digest: str
     trained: dict[str, Any] = {}
 
@@ -179,13 +181,13 @@ class DetectorSettings:
         least_object: Probability that a cell shows an object from which it votes.
         reach: Distance from the center within which votes belong to it [m].
         few: Votes of an object that is half hidden; the score of fewer is lower.
-        least_score: Score below which there is no object.
+        least_score: Score below which there is no object, or None for that of the checkpoint.
     """
 
     least_object: float = 0.3
-    reach: float = 0.03
+    reach: float = 0.045
     few: float = 2.0
-    least_score: float = 0.5
+    least_score: float | None = None
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -194,7 +196,8 @@ class DetectorSettings:
             ParameterError: A number is out of its range.
         """
         check_number(self.least_object, "least_object", 0.0, 1.0)
-        check_number(self.least_score, "least_score", 0.0, 1.0)
+        if self.least_score is not None:
+            check_number(self.least_score, "least_score", 0.0, 1.0)
         check_positive(self.reach, "reach")
         check_positive(self.few, "few")
 
@@ -362,8 +365,9 @@ class ObjectDetector:
             raise ParameterError("pose", None, f"the pose of {camera.name!r}, which is on {camera.link!r}")
         at = camera.pose if pose is None else rigid_pose(pose, "pose")
         view = standard_view(camera)
+        least = self.config.least_score if self.settings.least_score is None else self.settings.least_score
         candidates = grouped(self.votes(frame, at), self.settings)
-        return tuple(self._object(one, at, view, camera) for one in candidates)
+        return tuple(self._object(one, at, view, camera) for one in candidates if one.score >= least)
 
     def votes(self, frame: Frame, pose: Array) -> CellVotes:
         """Return the votes of the cells of a frame whose camera has a pose in the world, shape (4, 4) [m]."""
@@ -448,10 +452,8 @@ def grouped(votes: CellVotes, settings: DetectorSettings) -> list[Candidate]:
             center = part @ votes.center[inside] / part.sum()
         own = left & (np.linalg.norm(votes.center - center, axis=1) < settings.reach)
         own[int(np.argmax(density))] = True
-        left &= ~(own | (np.linalg.norm(votes.center - center, axis=1) < 1.5 * settings.reach))
-        one = _candidate(votes.of(own), center, settings)
-        if one.score >= settings.least_score:
-            found.append(one)
+        left &= ~own
+        found.append(_candidate(votes.of(own), center, settings))
     return sorted(found, key=lambda one: -one.score)
 
 

@@ -121,7 +121,9 @@ def votes_of(centers: list[list[float]], axes: list[np.ndarray], kinds: list[int
 def test_votes_that_agree_are_objects() -> None:
     centers = [[0.1, 0.0, 1.2], [0.17, 0.0, 1.2]]
     axes = [np.array([0.0, -1.0, 0.0]), np.array([0.6, 0.0, -0.8])]
-    found = grouped(votes_of(centers, axes, [KINDS.index("cup"), KINDS.index("peg")], 40), DetectorSettings())
+    every = grouped(votes_of(centers, axes, [KINDS.index("cup"), KINDS.index("peg")], 40), DetectorSettings())
+    assert [one.score for one in every] == sorted((one.score for one in every), reverse=True)
+    found = [one for one in every if one.score > 0.5]
     assert sorted(KINDS[one.kind] for one in found) == ["cup", "peg"]
     for one in found:
         k = ["cup", "peg"].index(KINDS[one.kind])
@@ -132,8 +134,10 @@ def test_votes_that_agree_are_objects() -> None:
         assert one.score > 0.9 and len(one.cells) == 40
 
 
-def test_few_votes_and_none_are_no_object() -> None:
-    assert grouped(votes_of([[0.0, 0.0, 1.0]], [np.array([1.0, 0.0, 0.0])], [0], 1), DetectorSettings()) == []
+def test_few_votes_have_a_low_score_and_none_are_no_object() -> None:
+    few = grouped(votes_of([[0.0, 0.0, 1.0]], [np.array([1.0, 0.0, 0.0])], [0], 1), DetectorSettings())
+    many = grouped(votes_of([[0.0, 0.0, 1.0]], [np.array([1.0, 0.0, 0.0])], [0], 9), DetectorSettings())
+    assert few[0].score < 0.5 and many[0].score > 0.9
     nothing = votes_of([[0.0, 0.0, 1.0]], [np.array([1.0, 0.0, 0.0])], [0], 1).of(np.zeros(0, int))
     assert grouped(nothing, DetectorSettings()) == []
 
@@ -170,7 +174,14 @@ class Oracle(torch.nn.Module):
 
 
 def test_true_votes_are_true_objects(scenes: list[ObjectScene]) -> None:
-    config = {"schema": SCHEMA, "kinds": KINDS, "widths": WIDTHS, "spreads": spreads(), "digest": ""}
+    config = {
+        "schema": SCHEMA,
+        "kinds": KINDS,
+        "widths": WIDTHS,
+        "spreads": spreads(),
+        "least_score": 0.4,
+        "digest": "",
+    }
     count = 0
     for scene in scenes:
         found = ObjectDetector(Oracle(scene), DetectorConfig.model_validate(config)).find(scene.frame)  # type: ignore[arg-type]
@@ -279,7 +290,7 @@ def folder(tmp_path: Path) -> Path:
     weights = save_arrays({name: value.half().numpy() for name, value in state.items()})
     made = {name: one.model_dump(mode="json") for name, one in spreads().items()}
     config = {
-        "schema": SCHEMA, "kinds": KINDS, "widths": WIDTHS, "spreads": made,
+        "schema": SCHEMA, "kinds": KINDS, "widths": WIDTHS, "spreads": made, "least_score": 0.5,
         "digest": hashlib.sha256(weights).hexdigest(), "trained": {},
     }  # fmt: skip
     (tmp_path / "model.safetensors").write_bytes(weights)

@@ -88,12 +88,15 @@ def test_a_training_goes_on_and_its_checkpoint_is_read(
     script.train(folder, 8, 2)
     reports = capsys.readouterr().out.splitlines()
     assert [int(one.split()[0]) for one in reports] == [4, 8]
-    rows = {kind: [[1.0, 4.0, 1.0, 0.01, 0.04]] for kind in KINDS}
-    monkeypatch.setattr(script, "residuals", lambda detector, data: rows)  # an untrained network finds nothing
+    rows = [script.Judged(0.8, kind, True, [1.0, 4.0, 1.0, 0.01, 0.04]) for kind in KINDS]
+    rows += [script.Judged(0.1, "can", False, []) for _ in range(6)]
+    monkeypatch.setattr(script, "judged", lambda detector, data: (rows, 8))  # an untrained network finds nothing
     script.save(folder, folder / "checkpoint")
     detector = ObjectDetector.load(folder / "checkpoint")
+    assert detector.config.least_score == 0.8
     assert detector.config.trained["step"] == 8 and detector.config.trained["frames"] == 3
     spread = detector.config.spreads["can"]
     assert spread.along == pytest.approx((4.0 / 2.706) ** 0.5, rel=0.01)
     assert spread.across == pytest.approx((1.0 / 4.605) ** 0.5, rel=0.01)
-    assert "8 of 8" in (folder / "checkpoint" / "README.md").read_text()
+    assert "step 8 of 8" in (folder / "checkpoint" / "README.md").read_text()
+    assert "precision 1.00, recall 0.75" in (folder / "checkpoint" / "README.md").read_text()
