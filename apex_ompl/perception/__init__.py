@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from apex_ompl.perception.camera import DepthErrors as DepthErrors
     from apex_ompl.perception.camera import look_at as look_at
     from apex_ompl.perception.depth_scale import measured_depths as measured_depths
+    from apex_ompl.perception.detection_fit import DetectionFit as DetectionFit
+    from apex_ompl.perception.detector import DetectedObject as DetectedObject
+    from apex_ompl.perception.detector import DetectorSettings as DetectorSettings
+    from apex_ompl.perception.detector import ObjectDetector as ObjectDetector
     from apex_ompl.perception.frames import Frame as Frame
     from apex_ompl.perception.frames import load_frames as load_frames
     from apex_ompl.perception.frames import mean_frame as mean_frame
@@ -54,6 +58,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "boards": "Board",
         "camera": "Camera DepthErrors look_at",
         "depth_scale": "measured_depths",
+        "detection_fit": "DetectionFit",
+        "detector": "DetectedObject DetectorSettings ObjectDetector",
         "frames": "Frame load_frames mean_frame save_sequence",
         "hand_eye": "Calibration View calibrate",
         "held": "HeldObject HeldObjectFinder HeldSettings",

@@ -311,11 +311,15 @@ class HeldObjectFinder:
 
     def find_in(self, seen: CorrectedFrame) -> tuple[HeldObject, ...]:
         """Return where the objects are in a frame that is corrected already, in the order of ``attached``."""
+        return self.find_expected(seen, self.expected(seen.registration.state))
+
+    def find_expected(self, seen: CorrectedFrame, expected: Sequence[Expected]) -> tuple[HeldObject, ...]:
+        """Return where objects are in a frame that is corrected already, from what is expected of them."""
         found = seen.registration
         poses = self._robot.poses(found.state)
         thin = self._robot.seen_from(found.pose, poses)
         thick = self._robot.seen_from(found.pose, poses, self.settings.thickness)
-        return tuple(self._find_one(one, seen, thin, thick) for one in self.expected(found.state))
+        return tuple(self._find_one(one, seen, thin, thick) for one in expected)
 
     def _find_one(
         self, one: Expected, seen: CorrectedFrame, thin: Array, thick: Array

@@ -6,7 +6,7 @@ nothing but the triangles of meshes. Both draw the camera as a pinhole; its dist
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple, Protocol
@@ -153,6 +153,25 @@ class Mujoco:
 
     def draw(self, parts: Sequence[Part], camera: Camera, pose: Array) -> View:
         """Return what a camera at a pose sees, with normals of differences of depth."""
+        return self._drawn(parts, camera, pose)[0]
+
+    def draw_lit(
+        self, parts: Sequence[Part], camera: Camera, pose: Array, dress: Callable[[Any, Any], None]
+    ) -> tuple[View, NDArray[np.uint8]]:  # fmt: skip
+        """Return what a camera at a pose sees, and its color image with MuJoCo's lights, shadows and textures.
+
+        Args:
+            parts: The parts, each of which is a geom; their own colors are not used.
+            camera: The camera.
+            pose: Pose of its optical frame, shape (4, 4) [m].
+            dress: Gets MuJoCo and the ``MjSpec``, to add lights and materials.
+        """
+        view, color = self._drawn(parts, camera, pose, dress)
+        return view, resampled(color, _distorting(camera) if any(camera.distortion) else None)
+
+    def _drawn(
+        self, parts: Sequence[Part], camera: Camera, pose: Array, dress: Callable[[Any, Any], None] | None = None
+    ) -> tuple[View, NDArray[np.uint8]]:  # fmt: skip
         library = self._mujoco
         spec = library.MjSpec()
         spec.stat.extent = 1.0  # in which the next two are measured
@@ -164,6 +183,8 @@ class Mujoco:
         for k, part in enumerate(parts):
             self._add(spec, part, k)
         self._place(spec, camera, pose)
+        if dress is not None:
+            dress(library, spec)
         model = spec.compile()
         data = library.MjData(model)
         library.mj_forward(model, data)
@@ -175,10 +196,15 @@ class Mujoco:
             renderer.enable_segmentation_rendering()
             renderer.update_scene(data, "camera")
             number = renderer.render()[..., 0]
+            color = np.zeros((*depth.shape, 3), np.uint8)
+            if dress is not None:
+                renderer.disable_segmentation_rendering()
+                renderer.update_scene(data, "camera")
+                color = np.array(renderer.render())
         there = number >= 0
         depth = np.where(there, depth, 0.0)
         labels = np.where(there, np.array([part.label for part in parts])[number], 0)
-        return seen_through(camera, View(depth, labels, depth_normals(depth, camera)))
+        return seen_through(camera, View(depth, labels, depth_normals(depth, camera))), color
 
     def _add(self, spec: Any, part: Part, k: int) -> None:
         """Add a part as one geom."""

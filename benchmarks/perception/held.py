@@ -5,8 +5,9 @@ What is reported differs from the truth: grasps by standard deviations of (8, 8,
 closings of the fingers by 0.05, the camera by 2 mm and 0.2 degrees, the scale of depth by 0.3 %. Depths have noise of
 3.8 mm at 1 m that 4 x 4 pixels share for the most part, no values at edges and in shadows of the second imager, and
 patches without any. Of a ball errors are those of its center. "nine frames" have noise of their own, the robot at
-rest. Objects whose center is outside the image do not count. "share" is that of objects with an answer; of "gate"
-that of objects whose own standard deviations are at most 4.5 mm and 2.2 degrees, too. "squared" is the mean of
+rest; "one frame, detector" starts at what the grasp and the learned detector say together. Objects whose center is
+outside the image do not count. "share" is that of objects with an answer; of "gate" that of objects whose own standard
+deviations are at most 4.5 mm and 2.2 degrees, too. "squared" is the mean of
 normalized squared errors over their 6 dimensions with its 95 % band by chi-squared, "within" the share of objects
 within the 95 % ellipsoid. In brackets: each seed. Times are CPU times of a frame with both hands, on one core.
 
@@ -25,9 +26,13 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from apex_ompl.perception.frames import mean_frame
-from apex_ompl.perception.held import HeldObjectFinder
+from apex_ompl.perception.detection_fit import fused, nearest
+from apex_ompl.perception.detector import ObjectDetector
+from apex_ompl.perception.frames import Frame, mean_frame
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.registration import corrected
 from apex_ompl.perception.rendering import Mujoco, Renderer, ZBuffer
+from apex_ompl.perception.surfaces import RobotSurface
 from apex_ompl.perception.synthetic import SceneGenerator, SyntheticSettings, TrueObject
 from apex_ompl.problems.objects import DATA
 from apex_ompl.problems.suite_robot import robot
@@ -49,7 +54,7 @@ GATE = (0.0045, 2.2)  # largest own standard deviations of face [m] and axis [de
 RENDERERS = 2  # that draw the same scenes, so that bands are those of half of the objects
 DIMENSIONS = 6
 CHI_SQUARED, MEDIAN = 12.592, 5.348  # 95 % and 50 % of six degrees of freedom
-METHODS = ("grasp alone", "one frame", "nine frames")
+METHODS = ("grasp alone", "one frame", "nine frames", "one frame, detector")
 
 
 @dataclass(frozen=True)
@@ -103,19 +108,33 @@ def _sample(scene: int, method: str, one: TrueObject, found: Any, spent: float) 
     )  # fmt: skip
 
 
+def _with_detector(
+    frame: Frame, finder: HeldObjectFinder, detector: ObjectDetector
+) -> tuple[tuple[HeldObject, ...], float]:
+    """Return the objects as found by fits that start at grasps and detections together, and the CPU time [s]."""
+    started = time.process_time()
+    found = detector.find(frame)
+    seen = corrected(frame, RobotSurface(finder.robot), finder.settings.registration)
+    expected = finder.expected(seen.registration.state)
+    near = [nearest(found, one.body.name, one) for one in expected]
+    both = [one if it is None else fused(one, it) for one, it in zip(expected, near, strict=True)]
+    return finder.find_expected(seen, both), time.process_time() - started
+
+
 def samples(made: Robot, renderer: Renderer, seed: int, n: int) -> list[Sample]:
     """Return all objects of ``n`` scenes, found by each method."""
-    generator, found = SceneGenerator(made, DATA, renderer), []
+    generator, found, detector = SceneGenerator(made, DATA, renderer), [], ObjectDetector.load()
     for k in tqdm(range(n), desc=f"{type(renderer).__name__} {seed}"):
-        scene = generator.draw(np.random.default_rng((seed, k)), SyntheticSettings(frames=FRAMES))
+        scene = generator.draw(np.random.default_rng((seed, k)), SyntheticSettings(frames=FRAMES, colors=True))
         finder = HeldObjectFinder(made, [one.reported for one in scene.objects])
         answers = {"grasp alone": (finder.by_grasp(scene.frames[0]), 0.0)}
-        for method, count in zip(METHODS[1:], (1, FRAMES), strict=True):
+        for method, count in zip(METHODS[1:3], (1, FRAMES), strict=True):
             started = time.process_time()
             frame = mean_frame(scene.frames[:count])
             averaged = time.process_time()
             answer = finder.find(frame, count)
             answers[method] = answer, time.process_time() - (started if count == 1 else averaged)
+        answers[METHODS[3]] = _with_detector(scene.frames[0], finder, detector)
         for method, (answer, spent) in answers.items():
             found += [
                 _sample(k, method, one, its, spent)
@@ -228,7 +247,7 @@ def tables(drawn: dict[str, dict[int, list[Sample]]], n: int) -> tuple[dict[str,
     found = [one for by_seed in drawn.values() for mine in by_seed.values() for one in mine]
     missed: dict[str, int] = {}
     for one in found:
-        if one.reason and one.method == METHODS[-1]:
+        if one.reason and one.method == METHODS[2]:
             words = re.sub(r"'[^']*':?|[0-9.]+ ?%?", "", one.reason).strip()
             missed[words] = missed.get(words, 0) + 1
     reasons = [[reason, count] for reason, count in sorted(missed.items(), key=lambda item: -item[1])]

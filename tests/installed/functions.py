@@ -388,11 +388,15 @@ def _use_fits() -> None:
     import apex_ompl
     from apex_ompl.perception import (
         AlignSettings,
+        DetectedObject,
+        DetectionFit,
+        DetectorSettings,
         HeldObjectFinder,
         HeldSettings,
         KnownSize,
         LookSettings,
         LookState,
+        ObjectDetector,
         ObjectView,
         ObstacleFinder,
         ObstacleSettings,
@@ -419,6 +423,11 @@ def _use_fits() -> None:
         assert one.face.shape == one.axis.shape == (3,) and one.face_covariance.shape == (3, 3)
         assert one.name and one.face_spread > 0.0 and one.axis_spread > 0.0
     assert frame.color is not None and len(finder.expected(robot.home)) == 2
+    detector = ObjectDetector.load(settings=DetectorSettings(least_score=0.3))
+    detected = detector.find(frame)
+    bodies = {one.name: one for one in attached}
+    assert len(DetectionFit(robot, bodies).refine(frame, detected)) <= len(detected)
+    assert all(isinstance(one, DetectedObject) and one.pose.shape == (4, 4) for one in detected)
     obstacles = ObstacleFinder(ObstacleSettings())
     assert obstacles.colored(frame.color).any()
     given, tracker = corrected(frame, RobotSurface(robot), None), ObstacleTracker(TrackerSettings(births=1, of=1))
