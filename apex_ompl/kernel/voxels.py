@@ -74,32 +74,35 @@ class DepthWindows(NamedTuple):
     """Least depths of windows of an image.
 
     Attributes:
-        blocks: The blocks of the image.
-        near: Least depths of blocks, of 3x3 blocks around each, of 5x5 and so on, shape (levels, rows, columns) [m]; 0
-            where one of them is not known, or outside of the image.
+        blocks: The cells of the image.
+        near: Least depths of windows of 2^n x 2^n cells that begin at each, shape (levels, rows, columns) [m]; 0 where
+            one of them is not known, or outside of the image.
+        far: Largest depths of tiles [m].
         nearest: Smallest depth that counts [m].
         farthest: Depth up to which a larger one shows the space to be free [m].
     """
 
     blocks: ImageBlocks
     near: Singles
+    far: Singles
     nearest: float
     farthest: float
 
     @classmethod
-    def of(cls, blocks: ImageBlocks, image: Array, span: tuple[float, float], missing: float, levels: int) -> Self:
+    def of(cls, blocks: ImageBlocks, image: Array, span: tuple[float, float], missing: float) -> Self:
         """Return the windows of an image.
 
         Args:
-            blocks: The blocks of its camera.
+            blocks: The cells of its camera.
             image: Depths, 0 where there is none, shape (height, width) [m].
             span: Smallest and largest depth that count [m].
-            missing: Largest share of pixels without a depth in a block that is known.
-            levels: Number of sizes of windows.
+            missing: Largest share of pixels without a depth in a cell that is known, or in those around it.
         """
-        near = np.empty((levels, *blocks.shape), np.float32)
-        voxels.block_depths(blocks.depths(image), blocks.first, blocks.whole, *span, missing, near)
-        return cls(blocks, near, *span)
+        rows, columns = blocks.shape
+        near = np.empty((max(min(rows, columns).bit_length(), 3), rows, columns), np.float32)
+        far = np.empty((-(-rows // voxels.TILE), -(-columns // voxels.TILE)), np.float32)
+        voxels.cell_depths(blocks.depths(image), blocks.first, blocks.whole, *span, missing, near, far)
+        return cls(blocks, near, far, *span)
 
 
 class SeenPoints(NamedTuple):
@@ -182,16 +185,11 @@ class VoxelUpdate(NamedTuple):
         """Change the evidence of voxels, shape (nx, ny, nz)."""
         blocks, pose = windows.blocks, compact(self.pose)
         hits = self.fill(evidence, points, (windows.nearest, windows.farthest))
-        halves = 0.5 * self.side * np.abs(pose[:3, :3]).sum(axis=0)  # along the axes of the camera
         corner, side = blocks.plane
-        widest = np.abs(np.stack([corner, corner + side * blocks.shape[::-1]])).max(axis=0)
-        radius = ((halves[:2] + widest * halves[2] + self.shift) / side).max()
+        lens = [*corner, *(1.0 / side), windows.nearest, windows.farthest, self.scale, self.angle, self.shift]
         voxels.clear_voxels(
-            evidence, hits, windows.near, blocks.plane, pose, self.origin, self.side,
-            windows.nearest + float(halves[2]), windows.farthest, 1.0 + self.scale + self.angle * float(widest.sum()),
-            float(halves[2]) + self.shift, float(halves[2]), float(radius),
-            float((self.angle * (1.0 + widest * widest) / side).max()),
-        )  # fmt: skip
+            evidence, hits, windows.near, windows.far, pose, self.origin, self.side, np.array(lens, float)
+        )
 
 
 def mark_near(shape: tuple[int, int, int], origin: Array, side: float, spheres: Array) -> Bytes:

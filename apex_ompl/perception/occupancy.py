@@ -224,7 +224,7 @@ class OccupancyMap:
         depth, stride = camera.depth, settings.stride
         blocks, samples = self._blocks_of(camera)
         image = frame.depth * depth.scale
-        windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing, LEVELS)
+        windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing)
         points = SeenPoints.of(samples, image[::stride, ::stride], spheres)
         self._change(camera, pose).apply(self.evidence, windows, points)
 

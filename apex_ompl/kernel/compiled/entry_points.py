@@ -366,7 +366,7 @@ OTHERS: Functions = {
         "i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]",
         3,
     ),
-    "perception.voxels.block_depths": ("f4[::1], i8[::1], i1[::1], f8, f8, f8, f4[:, :, ::1]", 1),
+    "perception.voxels.cell_depths": ("f4[::1], i8[::1], i1[::1], f8, f8, f8, f4[:, :, ::1], f4[:, ::1]", 1),
     "perception.voxels.mark_inside": (
         "f4[::1], f4[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], i1[::1]",
         1,
@@ -377,7 +377,7 @@ OTHERS: Functions = {
         1,
     ),
     "perception.voxels.clear_voxels": (
-        "i1[:, :, ::1], i1[:, :, ::1], f4[:, :, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8" + 7 * ", f8",
+        "i1[:, :, ::1], i1[:, :, ::1], f4[:, :, ::1], f4[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1]",
         2,
     ),
     "perception.voxels.mark_near": ("i1[:, :, ::1], f8[:, ::1], f8[::1], f8", 1),

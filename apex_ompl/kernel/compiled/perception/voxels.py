@@ -14,47 +14,74 @@ from apex_ompl.kernel.compiled.layout import Bytes, Floats, Integers, Singles
 FREE, UNKNOWN = -1, 0  # evidence of a voxel; above it the voxel is occupied
 ENOUGH = 127  # number of points of a voxel that an image shows to be occupied
 MOST_OF = 0.5  # share of the points to be expected that is enough where these are few
-UNSEEN = 0.0  # depth of a block that is not known
+UNSEEN = 0.0  # depth of a cell that is not known
+TILE = 8  # cells along a side of the tiles whose largest depths are kept
+BLOCK = 8  # voxels along a side of the blocks that are decided together
+HIDDEN, PARTLY, IN_FRONT = -1, 0, 1
 
 
 @entry_point
-def block_depths(
+def cell_depths(
     depths: Singles, first: Integers, whole: Bytes, nearest: float, farthest: float, missing: float, near: Singles,
+    far: Singles,
 ) -> None:  # fmt: skip
-    """Find the least depth of each block, and those of the blocks around it.
+    """Find the least depths of cells and of square windows of them, and the largest depths of tiles.
+
+    A cell without a depth for too many of its pixels has the least depth of the 3x3 cells around it, if these have
+    enough.
 
     Args:
-        depths: Depths of the pixels in the order of blocks, shape (P,) [m]; UNSEEN where there is none.
-        first: First pixel of each block, and P, shape (rows columns + 1,).
-        whole: Whether the image holds a block as a whole, shape (rows columns,).
+        depths: Depths of the pixels in the order of cells, shape (P,) [m]; UNSEEN where there is none.
+        first: First pixel of each cell, and P, shape (rows columns + 1,).
+        whole: Whether the image holds a cell as a whole, shape (rows columns,).
         nearest: Smallest depth that counts [m].
         farthest: Depth up to which a larger one shows the space to be free [m].
-        missing: Largest share of pixels without a depth in a block that is known.
-        near: Gets the least depths of blocks, of 3x3 blocks around each, of 5x5 and so on, shape (levels, rows,
-            columns) [m]; UNSEEN where one of them is not known, or outside of the image.
+        missing: Largest share of pixels without a depth.
+        near: Gets the least depths of windows of 2^n x 2^n cells that begin at a cell, shape (levels, rows, columns)
+            [m]; UNSEEN where one of them is not known, or outside of the image. There are three levels at least.
+        far: Gets the largest depth of a cell in each tile of TILE x TILE cells, shape (rows / TILE, columns / TILE),
+            rounded up [m].
     """
     levels, rows, columns = near.shape
+    least, lost = near[1], near[2]
     for i in range(rows):
         for j in range(columns):
-            block, lost, least = i * columns + j, 0, farthest
-            for p in range(first[block], first[block + 1]):
+            cell, gaps, low = i * columns + j, 0, farthest
+            for p in range(first[cell], first[cell + 1]):
                 if depths[p] >= nearest:
-                    least = min(least, depths[p])
+                    low = min(low, depths[p])
                 else:
-                    lost += 1
-            known = whole[block] != 0 and lost <= missing * (first[block + 1] - first[block])
-            near[0, i, j] = least if known else UNSEEN
+                    gaps += 1
+            least[i, j], lost[i, j] = low, gaps
+    for i in range(far.shape[0]):
+        for j in range(far.shape[1]):
+            far[i, j] = UNSEEN
+    for i in range(rows):
+        for j in range(columns):
+            cell = i * columns + j
+            low, count = least[i, j], first[cell + 1] - first[cell]
+            known = whole[cell] != 0
+            if known and (count == 0 or lost[i, j] > missing * count):
+                gaps, count = 0.0, 0
+                for a in range(max(i - 1, 0), min(i + 2, rows)):
+                    for b in range(max(j - 1, 0), min(j + 2, columns)):
+                        low, gaps = min(low, least[a, b]), gaps + lost[a, b]
+                        count += first[a * columns + b + 1] - first[a * columns + b]
+                known = gaps <= missing * count
+            near[0, i, j] = low if known else UNSEEN
+            far[i // TILE, j // TILE] = max(far[i // TILE, j // TILE], near[0, i, j])
     for level in range(1, levels):
-        before = near[level - 1]
+        before, half = near[level - 1], 1 << (level - 1)
         for i in range(rows):
-            for j in range(columns):
-                if i < level or j < level or i >= rows - level or j >= columns - level:
+            if i + 2 * half > rows:
+                for j in range(columns):
                     near[level, i, j] = UNSEEN
-                    continue
-                a = min(before[i - 1, j - 1], before[i - 1, j], before[i - 1, j + 1])
-                b = min(before[i, j - 1], before[i, j], before[i, j + 1])
-                c = min(before[i + 1, j - 1], before[i + 1, j], before[i + 1, j + 1])
-                near[level, i, j] = min(a, b, c)
+                continue
+            for j in range(columns - 2 * half + 1):
+                a, b = min(before[i, j], before[i, j + half]), min(before[i + half, j], before[i + half, j + half])
+                near[level, i, j] = min(a, b)
+            for j in range(max(columns - 2 * half + 1, 0), columns):
+                near[level, i, j] = UNSEEN
 
 
 @inlined
@@ -162,76 +189,162 @@ def fill_voxels(
 
 
 @inlined
-def _narrowed(low: float, high: float, start: float, step: float) -> tuple[float, float]:
-    """Return where start + step t >= 0 holds in a range of t; an empty range where it does not."""
-    if step > 0.0:
-        return max(low, -start / step), high
-    if step < 0.0:
-        return low, min(high, -start / step)
-    return low, (high if start >= 0.0 else low - 1.0)
+def _quotients(across: float, along: float, half: float, low: float, high: float) -> tuple[float, float]:
+    """Return the least and the largest quotient of numbers within ``half`` of ``across`` and from ``1 / low`` on."""
+    a, b = across - half, across + half
+    return a * (low if a < 0.0 else high), b * (low if b > 0.0 else high)
+
+
+@inlined
+def _least_depth(near: Singles, i0: int, i1: int, j0: int, j1: int) -> float:
+    """Return the least depth of the cells of a rectangle, UNSEEN where one is not known or outside of the image."""
+    levels, rows, columns = near.shape
+    if i0 < 0 or j0 < 0 or i1 >= rows or j1 >= columns:
+        return UNSEEN
+    size, level = max(i1 - i0, j1 - j0) + 1, 0
+    while 2 << level <= size:
+        level += 1
+    width = 1 << level
+    if level >= levels or width > min(rows, columns):
+        return UNSEEN
+    a, b, c, d = min(i0, rows - width), max(i1 - width + 1, 0), min(j0, columns - width), max(j1 - width + 1, 0)
+    return min(min(near[level, a, c], near[level, a, d]), min(near[level, b, c], near[level, b, d]))
+
+
+@inlined
+def _largest_depth(far: Singles, rows: int, columns: int, i0: int, i1: int, j0: int, j1: int) -> float:
+    """Return the largest depth of the tiles that a rectangle of cells reaches into; UNSEEN outside of the image."""
+    found = UNSEEN
+    for i in range(max(i0, 0) // TILE, min(i1, rows - 1) // TILE + 1):
+        for j in range(max(j0, 0) // TILE, min(j1, columns - 1) // TILE + 1):
+            found = max(found, far[i, j])
+    return found
+
+
+@inlined
+def _kind(
+    near: Singles, far: Singles, lens: Floats, x: float, y: float, z: float, spans: tuple[float, float, float],
+    block: bool,
+) -> int:  # fmt: skip
+    """Return whether a box is IN_FRONT of all surfaces around it, or HIDDEN: behind them all, or outside of the image.
+
+    Args:
+        near: Least depths by :func:`cell_depths`, shape (levels, rows, columns) [m].
+        far: Largest depths.
+        lens: See :func:`clear_voxels`.
+        x: Center of the box in the optical frame [m].
+        y: As ``x``.
+        z: As ``x``.
+        spans: Half the extents of the box along the axes of the optical frame [m].
+        block: Whether HIDDEN is to be told from PARTLY.
+    """
+    shift = lens[8]
+    front, back = z - spans[2], z + spans[2]
+    if block and (back < lens[4] or front > lens[5]):
+        return HIDDEN
+    if front - shift <= 1e-3:
+        return PARTLY
+    low, high = 1.0 / (front - shift), 1.0 / (back + shift)
+    u0, u1 = _quotients(x, z, spans[0] + shift, low, high)
+    v0, v1 = _quotients(y, z, spans[1] + shift, low, high)
+    widest, highest = max(abs(u0), abs(u1)), max(abs(v0), abs(v1))
+    turn = lens[7] * (1.0 + widest * widest + highest * highest)
+    rows, columns = near.shape[1], near.shape[2]
+    j0, j1 = (u0 - turn - lens[0]) * lens[2], (u1 + turn - lens[0]) * lens[2]
+    i0, i1 = (v0 - turn - lens[1]) * lens[3], (v1 + turn - lens[1]) * lens[3]
+    if i1 < 0.0 or j1 < 0.0 or i0 >= rows or j0 >= columns:
+        return HIDDEN
+    if i0 >= 0.0 and j0 >= 0.0 and i1 < rows and j1 < columns and front >= lens[4] and back <= lens[5]:
+        reach = back * (1.0 + lens[6] + lens[7] * (widest + highest)) + shift
+        if reach < _least_depth(near, int(i0), int(i1), int(j0), int(j1)):
+            return IN_FRONT
+    if block:
+        a, b = max(i0, 0.0), max(j0, 0.0)
+        i, j = min(i1, rows - 1.0), min(j1, columns - 1.0)
+        if front >= _largest_depth(far, rows, columns, int(a), int(i), int(b), int(j)):
+            return HIDDEN
+    return PARTLY
+
+
+@inlined
+def _lower(evidence: Bytes, hits: Bytes, i0: int, i1: int, j0: int, j1: int, k0: int, k1: int) -> None:
+    """Lower the evidence of the voxels of a box that hold too few points; not below FREE."""
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            for k in range(k0, k1):
+                found = evidence[i, j, k]
+                evidence[i, j, k] = found - (1 if found > FREE and hits[i, j, k] != ENOUGH else 0)
 
 
 @entry_point
 def clear_voxels(
-    evidence: Bytes, hits: Bytes, near: Singles, plane: Floats, pose: Floats, origin: Floats, side: float,
-    nearest: float, farthest: float, stretch: float, reach: float, half: float, radius: float,
-    margin: float,
+    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, origin: Floats, side: float, lens: Floats,
 ) -> None:  # fmt: skip
     """Lower the evidence of voxels that are in front of all surfaces which the image shows where they appear.
 
-    A voxel that holds no points becomes FREE step by step where it is in front of all depths in the window of blocks
-    that contains its image. Elsewhere the evidence of an occupied voxel goes down to UNKNOWN where the block at its
-    center is farther away than the voxel.
+    A voxel that holds no points becomes FREE step by step where it is in front of all depths of the cells that its
+    image touches, by the errors of the camera. Elsewhere the evidence of an occupied voxel goes down to UNKNOWN where
+    the cell at its center is farther away than the voxel. Blocks of voxels are decided together where they can be.
 
     Args:
         evidence: FREE, UNKNOWN or more for occupied voxels, shape (nx, ny, nz).
         hits: How many points each voxel holds, by :func:`fill_voxels`.
-        near: Least depths by :func:`block_depths`, shape (levels, rows, columns) [m].
-        plane: Corner of the first block and sides of a block at depth 1, shape (2, 2).
+        near: Least depths by :func:`cell_depths`, shape (levels, rows, columns) [m].
+        far: Largest depths.
         pose: Pose of the optical frame, shape (4, 4) [m].
         origin: Outer corner of the first voxel, shape (3,) [m].
         side: Side of a voxel [m].
-        nearest: Smallest depth of a center, more than ``half`` [m].
-        farthest: Largest depth of a center [m].
-        stretch: Factor of a center's depth by its largest relative error.
-        reach: Depth beyond it that must be free, too [m].
-        half: Half the extent of a voxel along the optical axis [m].
-        radius: Half the extent of a voxel's image, times depth less ``half`` [blocks m].
-        margin: What is added to that [blocks].
+        lens: Corner of the first cell at depth 1 (2) and cells in a unit there (2); smallest depth of what becomes
+            free, and the largest [m]; relative error of depths; errors of the camera's orientation [rad] and
+            position [m].
     """
     nx, ny, nz = evidence.shape
-    levels, rows, columns = near.shape
-    u0, v0, su, sv = plane[0, 0], plane[0, 1], 1.0 / plane[1, 0], 1.0 / plane[1, 1]
-    u1, v1 = u0 + columns * plane[1, 0], v0 + rows * plane[1, 1]
-    dx, dy, dz = pose[2, 0] * side, pose[2, 1] * side, pose[2, 2] * side
-    for i in range(nx):
-        for j in range(ny):
-            a, b = origin[0] + (i + 0.5) * side - pose[0, 3], origin[1] + (j + 0.5) * side - pose[1, 3]
-            c = origin[2] + 0.5 * side - pose[2, 3]
-            x = pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c
-            y = pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c
-            z = pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c
-            low, high = _narrowed(0.0, nz - 1.0, z - nearest, dz)
-            low, high = _narrowed(low, high, farthest - z, -dz)
-            low, high = _narrowed(low, high, x - u0 * z, dx - u0 * dz)
-            low, high = _narrowed(low, high, u1 * z - x, u1 * dz - dx)
-            low, high = _narrowed(low, high, y - v0 * z, dy - v0 * dz)
-            low, high = _narrowed(low, high, v1 * z - y, v1 * dz - dy)
-            if not low <= high:
-                continue
-            for k in range(int(math.ceil(low)), int(math.floor(high)) + 1):
-                found = evidence[i, j, k]
-                if found <= FREE or hits[i, j, k] == ENOUGH:
+    rows, columns = near.shape[1], near.shape[2]
+    hx = 0.5 * side * (abs(pose[0, 0]) + abs(pose[1, 0]) + abs(pose[2, 0]))
+    hy = 0.5 * side * (abs(pose[0, 1]) + abs(pose[1, 1]) + abs(pose[2, 1]))
+    hz = 0.5 * side * (abs(pose[0, 2]) + abs(pose[1, 2]) + abs(pose[2, 2]))
+    one = (hx, hy, hz)
+    for i0 in range(0, nx, BLOCK):
+        i1 = min(i0 + BLOCK, nx)
+        for j0 in range(0, ny, BLOCK):
+            j1, start = min(j0 + BLOCK, ny), -1
+            for k0 in range(0, nz, BLOCK):
+                k1 = min(k0 + BLOCK, nz)
+                a = origin[0] + 0.5 * (i0 + i1) * side - pose[0, 3]
+                b = origin[1] + 0.5 * (j0 + j1) * side - pose[1, 3]
+                c = origin[2] + 0.5 * (k0 + k1) * side - pose[2, 3]
+                x = pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c
+                y = pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c
+                z = pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c
+                kind = _kind(near, far, lens, x, y, z, (BLOCK * hx, BLOCK * hy, BLOCK * hz), True)
+                if kind == IN_FRONT:
+                    start = k0 if start < 0 else start
                     continue
-                depth = z + k * dz
-                inverse = 1.0 / depth
-                column = min(max(int(((x + k * dx) * inverse - u0) * su), 0), columns - 1)
-                row = min(max(int(((y + k * dy) * inverse - v0) * sv), 0), rows - 1)
-                level = int(radius / (depth - half) + margin) + 1
-                if level < levels and depth * stretch + reach < near[level, row, column]:
-                    evidence[i, j, k] = found - 1
-                elif found > UNKNOWN and depth + half < near[0, row, column]:
-                    evidence[i, j, k] = found - 1
+                if start >= 0:
+                    _lower(evidence, hits, i0, i1, j0, j1, start, k0)
+                    start = -1
+                if kind == HIDDEN:
+                    continue
+                for i in range(i0, i1):
+                    for j in range(j0, j1):
+                        a = origin[0] + (i + 0.5) * side - pose[0, 3]
+                        b = origin[1] + (j + 0.5) * side - pose[1, 3]
+                        for k in range(k0, k1):
+                            found = evidence[i, j, k]
+                            if found <= FREE or hits[i, j, k] == ENOUGH:
+                                continue
+                            c = origin[2] + (k + 0.5) * side - pose[2, 3]
+                            x = pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c
+                            y = pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c
+                            z = pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c
+                            if _kind(near, far, lens, x, y, z, one, False) == IN_FRONT:
+                                evidence[i, j, k] = found - 1
+                            elif found > UNKNOWN and z >= lens[4] + hz:
+                                u, v = (x / z - lens[0]) * lens[2], (y / z - lens[1]) * lens[3]
+                                if 0.0 <= u < columns and 0.0 <= v < rows and z + hz < near[0, int(v), int(u)]:
+                                    evidence[i, j, k] = found - 1
+            if start >= 0:
+                _lower(evidence, hits, i0, i1, j0, j1, start, nz)
 
 
 @entry_point
