@@ -27,6 +27,7 @@ class ImageBlocks(NamedTuple):
         whole: Whether the image holds the block as a whole, shape (rows columns,).
         plane: Corner of the first block, and sides of a block, shape (2, 2) [m].
         shape: Rows and columns of blocks.
+        size: Rows and columns of pixels.
         density: Pixels of a unit of the plane [1/m^2].
     """
 
@@ -36,6 +37,7 @@ class ImageBlocks(NamedTuple):
     whole: Bytes
     plane: Array
     shape: tuple[int, int]
+    size: tuple[int, int]
     density: float
 
     @classmethod
@@ -63,11 +65,11 @@ class ImageBlocks(NamedTuple):
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         singles = np.ascontiguousarray(flat[order], np.float32)
         plane, density = np.stack([low, side]), float(focal[0] * focal[1])
-        return cls(order, singles, first, whole.astype(np.int8), plane, (rows, columns), density)
+        return cls(order, singles, first, whole.astype(np.int8), plane, (rows, columns), (height, width), density)
 
     def depths(self, image: Array) -> Singles:
         """Return the depths of an image, shape (height, width), in the order of the pixels, shape (P,) [m]."""
-        return image.ravel()[self.order].astype(np.float32)
+        return image.astype(np.float32, copy=False).ravel()[self.order]
 
 
 class DepthWindows(NamedTuple):
@@ -121,17 +123,25 @@ class SeenPoints(NamedTuple):
     density: float
 
     @classmethod
-    def of(cls, blocks: ImageBlocks, image: Array, spheres: Array) -> Self:
+    def of(
+        cls, blocks: ImageBlocks, image: Array, spheres: Array, alike: tuple[float, float], support: int
+    ) -> Self:
         """Return the points of an image.
 
         Args:
-            blocks: The blocks of its camera.
+            blocks: The blocks of some of the pixels of its camera, at a stride of rows and columns.
             image: Depths, 0 where there is none, shape (height, width) [m].
             spheres: Centers in the optical frame and radii of spheres whose points are left out, shape (S, 4) [m].
+            alike: Factor of z^2 [1/m] and length [m] by which depths z of the same surface differ at most.
+            support: How many of the 8 pixels around a pixel must be of the same surface for it to have a point.
         """
-        depths = blocks.depths(image)
-        inside = np.zeros(len(depths), np.int8)
-        voxels.mark_inside(depths, blocks.rays, blocks.first, blocks.plane, blocks.shape[1], compact(spheres), inside)
+        found = np.empty(blocks.size, np.float32)
+        voxels.supported_depths(np.ascontiguousarray(image, np.float32), *alike, support, found)
+        depths = blocks.depths(found)
+        inside, ranges = np.zeros(len(depths), np.int8), np.empty((len(blocks.first) - 1, 2), np.float32)
+        voxels.mark_inside(
+            depths, blocks.rays, blocks.first, blocks.plane, blocks.shape[1], compact(spheres), ranges, inside
+        )
         return cls(blocks.rays, depths, inside, blocks.density)
 
 
@@ -164,32 +174,36 @@ class VoxelUpdate(NamedTuple):
     angle: float
     shift: float
 
-    def fill(self, evidence: Bytes, points: SeenPoints, span: tuple[float, float]) -> Bytes:
-        """Raise the evidence of voxels that hold enough points, and return how many each holds, ENOUGH where they are.
+    def fill(self, evidence: Bytes, hits: Bytes, points: SeenPoints, span: tuple[float, float]) -> Integers:
+        """Raise the evidence of voxels that hold enough points.
 
         Args:
             evidence: The evidence, shape (nx, ny, nz).
+            hits: Gets how many points each voxel holds, ENOUGH where they are enough; 0 at the start.
             points: The points.
             span: Smallest and largest depth that count [m].
+
+        Returns:
+            Numbers of the voxels that hold the points, -1 for none, shape (P,).
         """
-        hits = np.zeros_like(evidence)
+        cells = np.empty(len(points.depths), np.int64)
         sharp = self.side / (SPREAD * max(self.noise, LEAST_NOISE))
         voxels.fill_voxels(
-            evidence, hits, points.depths, points.rays, points.left_out, *span, compact(self.pose), self.origin,
+            evidence, hits, cells, points.depths, points.rays, points.left_out, *span, compact(self.pose), self.origin,
             self.side, points.density * self.side * self.side, sharp, self.share, float(self.least), self.gain,
             self.most,
         )  # fmt: skip
-        return hits
+        return cells
 
-    def apply(self, evidence: Bytes, windows: DepthWindows, points: SeenPoints) -> None:
-        """Change the evidence of voxels, shape (nx, ny, nz)."""
-        blocks, pose = windows.blocks, compact(self.pose)
-        hits = self.fill(evidence, points, (windows.nearest, windows.farthest))
-        corner, side = blocks.plane
+    def apply(self, evidence: Bytes, hits: Bytes, windows: DepthWindows, points: SeenPoints) -> None:
+        """Change the evidence of voxels, shape (nx, ny, nz); ``hits`` is 0 there before and after."""
+        cells = self.fill(evidence, hits, points, (windows.nearest, windows.farthest))
+        corner, side = windows.blocks.plane
         lens = [*corner, *(1.0 / side), windows.nearest, windows.farthest, self.scale, self.angle, self.shift]
         voxels.clear_voxels(
-            evidence, hits, windows.near, windows.far, pose, self.origin, self.side, np.array(lens, float)
+            evidence, hits, windows.near, windows.far, compact(self.pose), self.origin, self.side, np.array(lens, float)
         )
+        voxels.forget_hits(hits, cells)
 
 
 def mark_near(shape: tuple[int, int, int], origin: Array, side: float, spheres: Array) -> Bytes:

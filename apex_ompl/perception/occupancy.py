@@ -44,7 +44,7 @@ from apex_ompl.util.validation import (
 
 SCHEMA, ROLE, KEY = "apex-ompl/occupancy/1", "occupancy map", "map"
 MOST_VOXELS = 50_000_000
-LEVELS = 16  # sizes of windows of blocks; nearer voxels, whose images are larger, are not cleared
+SAMPLED = 4  # side of the blocks in which pixels are tested against the robot [pixels]
 POLICIES, SHAPES = ("free", "blocked"), ("points", "voxels")
 
 Unknown = Literal["free", "blocked"]
@@ -63,6 +63,8 @@ class OccupancySettings:
         share: Share of the points that a surface across the line of sight leaves in a voxel, at its depth and with the
             noise of depths, which makes the voxel occupied.
         least: How many of these points are the least; fewer are enough where hardly as many are to be expected.
+        support: Pixels around one, of 8, that must have about its depth for its point to count: depths at edges are
+            often those of no surface.
         persistence: Frames that must see through an occupied voxel, after one that saw it occupied, to free it.
         longest: The largest number of such frames, after many that saw it occupied.
         padding: Margin around robot and held objects inside of which points belong to them [m]; the noise of depths is
@@ -71,10 +73,11 @@ class OccupancySettings:
 
     spreads: float = 2.0
     missing: float = 0.5
-    block: int = 4
+    block: int = 2
     stride: int = 2
     share: float = 0.15
     least: int = 2
+    support: int = 3
     persistence: int = 3
     longest: int = 9
     padding: float = 0.015
@@ -91,6 +94,7 @@ class OccupancySettings:
         check_integer(self.stride, "stride", 1, 64)
         check_number(self.share, "share", 0.0, 1.0)
         check_integer(self.least, "least", 1, 100)
+        check_integer(self.support, "support", 0, 8)
         check_integer(self.persistence, "persistence", 1, 100)
         check_integer(self.longest, "longest", self.persistence, 100)
         check_number(self.padding, "padding", 0.0, 0.5)
@@ -141,6 +145,7 @@ class OccupancyMap:
         self.origin, self.resolution, self.robot = box[0].copy(), float(resolution), robot
         self.settings = settings or OccupancySettings()
         self.evidence: NDArray[np.int8] = np.zeros(tuple(np.maximum(counts, 1).astype(int).tolist()), np.int8)
+        self._hits = np.zeros_like(self.evidence)  # of the image at hand
         self._blocks: tuple[Camera, tuple[ImageBlocks, ImageBlocks]] | None = None  # of the last camera
 
     def __repr__(self) -> str:
@@ -221,12 +226,16 @@ class OccupancyMap:
     def _update(self, frame: Frame, pose: Array, spheres: Array) -> None:
         """Change the map by a frame of a camera at a pose, without what is in spheres of the optical frame."""
         camera, settings = frame.camera, self.settings
-        depth, stride = camera.depth, settings.stride
-        blocks, samples = self._blocks_of(camera)
-        image = frame.depth * depth.scale
+        depth, (blocks, _) = camera.depth, self._blocks_of(camera)
+        image = (frame.depth * depth.scale).astype(np.float32)
         windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing)
-        points = SeenPoints.of(samples, image[::stride, ::stride], spheres)
-        self._change(camera, pose).apply(self.evidence, windows, points)
+        self._change(camera, pose).apply(self.evidence, self._hits, windows, self._points(camera, image, spheres))
+
+    def _points(self, camera: Camera, image: Array, spheres: Array) -> SeenPoints:
+        """Return the points of an image, shape (height, width) [m], that are not in spheres of the optical frame."""
+        settings = self.settings
+        alike = settings.spreads * camera.depth.noise, self.resolution
+        return SeenPoints.of(self._blocks_of(camera)[1], image, spheres, alike, settings.support)
 
     def _change(self, camera: Camera, pose: Array) -> VoxelUpdate:
         """Return how images of a camera at a pose change the evidence."""
@@ -260,7 +269,7 @@ class OccupancyMap:
             size, stride = self.settings.block, self.settings.stride
             coarse = camera.focal[0] / stride, camera.focal[1] / stride
             blocks = ImageBlocks.of(camera.grid, camera.focal, size)
-            self._blocks = camera, (blocks, ImageBlocks.of(camera.grid[::stride, ::stride], coarse, size))
+            self._blocks = camera, (blocks, ImageBlocks.of(camera.grid[::stride, ::stride], coarse, SAMPLED))
         return self._blocks[1]
 
     def decay(self, steps: int = 1) -> None:

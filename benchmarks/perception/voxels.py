@@ -31,7 +31,7 @@ from apex_ompl import plan, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.kernel.voxels import ENOUGH, SeenPoints
+from apex_ompl.kernel.voxels import ENOUGH
 from apex_ompl.perception import Camera, OccupancyMap, look_at
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
@@ -151,12 +151,13 @@ def follow(evidence, hits, depth, left_out, rays, pose, origin, side):  # type: 
 
 def by_rays(made: OccupancyMap, camera: Camera, look: Look, q: np.ndarray, held: tuple[AttachedObject, ...]) -> None:
     """Change a map as rays do: hits as the map has them, the way to them by :func:`follow`."""
-    stride, (_, samples) = made.settings.stride, made._blocks_of(camera)
-    points = SeenPoints.of(
-        samples, look.depth[::stride, ::stride], made._own_spheres(q, held, look.assumed, camera.depth.noise)
+    spheres = made._own_spheres(q, held, look.assumed, camera.depth.noise)
+    points = made._points(camera, look.depth, spheres)
+    hits = np.zeros_like(made.evidence)
+    made._change(camera, look.assumed).fill(
+        made.evidence, hits, points, (camera.depth.nearest, camera.depth.farthest)
     )
-    span = camera.depth.nearest, camera.depth.farthest
-    hits = (made._change(camera, look.assumed).fill(made.evidence, points, span) == ENOUGH).astype(np.int8)
+    hits = (hits == ENOUGH).astype(np.int8)
     z = points.depths.astype(float)
     follow(
         made.evidence, hits, z, points.left_out, points.rays, look.assumed, made.origin, made.resolution

@@ -368,11 +368,11 @@ OTHERS: Functions = {
     ),
     "perception.voxels.cell_depths": ("f4[::1], i8[::1], i1[::1], f8, f8, f8, f4[:, :, ::1], f4[:, ::1]", 1),
     "perception.voxels.mark_inside": (
-        "f4[::1], f4[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], i1[::1]",
+        "f4[::1], f4[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], f4[:, ::1], i1[::1]",
         1,
     ),
     "perception.voxels.fill_voxels": (
-        "i1[:, :, ::1], i1[:, :, ::1], f4[::1], f4[:, ::1], i1[::1], f8, f8, f8[:, ::1], f8[::1], "
+        "i1[:, :, ::1], i1[:, :, ::1], i8[::1], f4[::1], f4[:, ::1], i1[::1], f8, f8, f8[:, ::1], f8[::1], "
         + "f8, f8, f8, f8, f8, i8, i8",
         1,
     ),
@@ -380,6 +380,8 @@ OTHERS: Functions = {
         "i1[:, :, ::1], i1[:, :, ::1], f4[:, :, ::1], f4[:, ::1], f8[:, ::1], f8[::1], f8, f8[::1]",
         2,
     ),
+    "perception.voxels.forget_hits": ("i1[:, :, ::1], i8[::1]", 1),
+    "perception.voxels.supported_depths": ("f4[:, ::1], f8, f8, i8, f4[:, ::1]", 1),
     "perception.voxels.mark_near": ("i1[:, :, ::1], f8[:, ::1], f8[::1], f8", 1),
     "geometry.triangles.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }

@@ -84,6 +84,32 @@ def cell_depths(
                 near[level, i, j] = UNSEEN
 
 
+@entry_point
+def supported_depths(image: Singles, noise: float, slack: float, least: int, found: Singles) -> None:
+    """Take depths at a stride, UNSEEN where too few of the 8 pixels around have about the same.
+
+    Args:
+        image: Depths, shape (height, width) [m]; UNSEEN where there is none.
+        noise: Depths z differ by at most ``noise`` z^2 and ``slack`` [1/m].
+        slack: See ``noise`` [m].
+        least: How many of the 8 pixels must.
+        found: Gets the depths, shape (rows, columns) [m]; the strides are quotients of the shapes, rounded up.
+    """
+    height, width = image.shape
+    rows, columns = found.shape
+    step, pace = (height + rows - 1) // rows, (width + columns - 1) // columns
+    for i in range(rows):
+        for j in range(columns):
+            v, u = i * step, j * pace
+            depth = image[v, u]
+            limit, count = noise * depth * depth + slack, 0
+            for a in range(max(v - 1, 0), min(v + 2, height)):
+                for b in range(max(u - 1, 0), min(u + 2, width)):
+                    if abs(image[a, b] - depth) <= limit:
+                        count += 1
+            found[i, j] = depth if count > least else UNSEEN
+
+
 @inlined
 def _tangents(across: float, along: float, radius: float) -> tuple[float, float]:
     """Return the least and the largest x / z of a circle about x = ``across``, z = ``along``, more than its radius."""
@@ -94,8 +120,9 @@ def _tangents(across: float, along: float, radius: float) -> tuple[float, float]
 
 @entry_point
 def mark_inside(
-    depths: Singles, rays: Singles, first: Integers, plane: Floats, columns: int, spheres: Floats, inside: Bytes
-) -> None:
+    depths: Singles, rays: Singles, first: Integers, plane: Floats, columns: int, spheres: Floats, ranges: Singles,
+    inside: Bytes,
+) -> None:  # fmt: skip
     """Mark the pixels whose points are inside of any sphere.
 
     Args:
@@ -105,9 +132,16 @@ def mark_inside(
         plane: Corner of the first block and sides of a block at depth 1, shape (2, 2).
         columns: Columns of blocks.
         spheres: Centers in the optical frame and radii, shape (S, 4) [m].
+        ranges: Gets the least and the largest depth of each block, shape (rows columns, 2) [m].
         inside: Gets 1 for these pixels, shape (P,); 0 at the start.
     """
     rows = (len(first) - 1) // columns
+    for block in range(rows * columns):
+        low, high = math.inf, UNSEEN
+        for p in range(first[block], first[block + 1]):
+            if depths[p] > UNSEEN:
+                low, high = min(low, depths[p]), max(high, depths[p])
+        ranges[block, 0], ranges[block, 1] = low, high
     for s in range(len(spheres)):
         x, y, z, radius = spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3]
         if z <= -radius:
@@ -123,6 +157,8 @@ def mark_inside(
         for i in range(int(i0), int(i1) + 1):
             for j in range(int(j0), int(j1) + 1):
                 block = i * columns + j
+                if ranges[block, 0] > z + radius or ranges[block, 1] < z - radius:
+                    continue
                 for p in range(first[block], first[block + 1]):
                     depth = depths[p]
                     if abs(depth - z) > radius or inside[p] != 0:
@@ -134,8 +170,8 @@ def mark_inside(
 
 @entry_point
 def fill_voxels(
-    evidence: Bytes, hits: Bytes, depths: Singles, rays: Singles, inside: Bytes, nearest: float, farthest: float,
-    pose: Floats, origin: Floats, side: float, dense: float, sharp: float, share: float, least: float, gain: int,
+    evidence: Bytes, hits: Bytes, cells: Integers, depths: Singles, rays: Singles, inside: Bytes, nearest: float,
+    farthest: float, pose: Floats, origin: Floats, side: float, dense: float, sharp: float, share: float, least: float, gain: int,
     most: int,
 ) -> None:  # fmt: skip
     """Raise the evidence of voxels that hold enough points of an image.
@@ -147,6 +183,7 @@ def fill_voxels(
     Args:
         evidence: FREE, UNKNOWN or more for occupied voxels, shape (nx, ny, nz).
         hits: Gets how many points each voxel holds, ENOUGH where they are enough; 0 at the start.
+        cells: Gets the number of the voxel that holds each point, -1 for none, shape (P,).
         depths: Depths of the pixels, shape (P,) [m]; UNSEEN or less where there is none.
         rays: Their points at depth 1, shape (P, 2).
         inside: Pixels that are left out, shape (P,).
@@ -166,7 +203,7 @@ def fill_voxels(
     scale = 1.0 / side
     x0, y0, z0 = pose[0, 3] - origin[0], pose[1, 3] - origin[1], pose[2, 3] - origin[2]
     for p in range(len(depths)):
-        depth = depths[p]
+        depth, cells[p] = depths[p], -1
         if not nearest <= depth <= farthest or inside[p] != 0:
             continue
         a, b = rays[p, 0] * depth, rays[p, 1] * depth
@@ -176,6 +213,7 @@ def fill_voxels(
         if not (0.0 <= x < nx and 0.0 <= y < ny and 0.0 <= z < nz):
             continue
         i, j, k = int(x), int(y), int(z)
+        cells[p] = (i * ny + j) * nz + k
         found = hits[i, j, k]
         if found == ENOUGH:
             continue
@@ -186,6 +224,16 @@ def fill_voxels(
             evidence[i, j, k] = min(max(evidence[i, j, k], UNKNOWN) + gain, most)
             found = ENOUGH
         hits[i, j, k] = found
+
+
+@entry_point
+def forget_hits(hits: Bytes, cells: Integers) -> None:
+    """Set how many points voxels hold to 0, by the numbers that :func:`fill_voxels` gave, shape (P,)."""
+    _, ny, nz = hits.shape
+    for p in range(len(cells)):
+        if cells[p] >= 0:
+            row = cells[p] // nz
+            hits[row // ny, row % ny, cells[p] % nz] = 0
 
 
 @inlined
@@ -303,6 +351,7 @@ def clear_voxels(
     hx = 0.5 * side * (abs(pose[0, 0]) + abs(pose[1, 0]) + abs(pose[2, 0]))
     hy = 0.5 * side * (abs(pose[0, 1]) + abs(pose[1, 1]) + abs(pose[2, 1]))
     hz = 0.5 * side * (abs(pose[0, 2]) + abs(pose[1, 2]) + abs(pose[2, 2]))
+    dx, dy, dz = pose[2, 0] * side, pose[2, 1] * side, pose[2, 2] * side
     one = (hx, hy, hz)
     for i0 in range(0, nx, BLOCK):
         i1 = min(i0 + BLOCK, nx)
@@ -325,24 +374,25 @@ def clear_voxels(
                     start = -1
                 if kind == HIDDEN:
                     continue
+                x, y, z = x - 0.5 * (k1 - k0) * dx, y - 0.5 * (k1 - k0) * dy, z - 0.5 * (k1 - k0) * dz
                 for i in range(i0, i1):
                     for j in range(j0, j1):
-                        a = origin[0] + (i + 0.5) * side - pose[0, 3]
-                        b = origin[1] + (j + 0.5) * side - pose[1, 3]
+                        a, b = (i - 0.5 * (i0 + i1) + 0.5) * side, (j - 0.5 * (j0 + j1) + 0.5) * side
                         for k in range(k0, k1):
                             found = evidence[i, j, k]
                             if found <= FREE or hits[i, j, k] == ENOUGH:
                                 continue
-                            c = origin[2] + (k + 0.5) * side - pose[2, 3]
-                            x = pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c
-                            y = pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c
-                            z = pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c
-                            if _kind(near, far, lens, x, y, z, one, False) == IN_FRONT:
+                            c = k - k0 + 0.5
+                            depth = z + pose[0, 2] * a + pose[1, 2] * b + c * dz
+                            if depth < lens[4] + hz:
+                                continue
+                            across, down = x + pose[0, 0] * a + pose[1, 0] * b + c * dx, y + pose[0, 1] * a + pose[1, 1] * b + c * dy
+                            inverse = 1.0 / depth
+                            u, v = (across * inverse - lens[0]) * lens[2], (down * inverse - lens[1]) * lens[3]
+                            if not (0.0 <= u < columns and 0.0 <= v < rows and depth + hz < near[0, int(v), int(u)]):
+                                continue
+                            if found > UNKNOWN or _kind(near, far, lens, across, down, depth, one, False) == IN_FRONT:
                                 evidence[i, j, k] = found - 1
-                            elif found > UNKNOWN and z >= lens[4] + hz:
-                                u, v = (x / z - lens[0]) * lens[2], (y / z - lens[1]) * lens[3]
-                                if 0.0 <= u < columns and 0.0 <= v < rows and z + hz < near[0, int(v), int(u)]:
-                                    evidence[i, j, k] = found - 1
             if start >= 0:
                 _lower(evidence, hits, i0, i1, j0, j1, start, nz)
 
