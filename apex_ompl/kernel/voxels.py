@@ -201,8 +201,9 @@ class VoxelUpdate(NamedTuple):
         corner, side = windows.blocks.plane
         lens = [*corner, *(1.0 / side), windows.nearest, windows.farthest, self.scale, self.angle, self.shift]
         voxels.clear_voxels(
-            evidence, hits, windows.near, windows.far, compact(self.pose), self.origin, self.side, np.array(lens, float)
-        )
+            evidence, hits, windows.near, windows.far, compact(self.pose), np.append(self.origin, self.side),
+            np.array(lens, float), np.empty(evidence.shape[2], np.int8),
+        )  # fmt: skip
         voxels.forget_hits(hits, cells)
 
 

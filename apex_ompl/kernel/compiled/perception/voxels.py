@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Bytes, Floats, Integers, Singles
 
@@ -18,6 +20,10 @@ UNSEEN = 0.0  # depth of a cell that is not known
 TILE = 8  # cells along a side of the tiles whose largest depths are kept
 BLOCK = 8  # voxels along a side of the blocks that are decided together
 HIDDEN, PARTLY, IN_FRONT = -1, 0, 1
+
+Box = tuple[int, int, int, int, int, int]
+"""First voxel and that after the last along each axis."""
+Spans = tuple[float, float, float]
 
 
 @entry_point
@@ -271,8 +277,7 @@ def _largest_depth(far: Singles, rows: int, columns: int, i0: int, i1: int, j0: 
 
 @inlined
 def _kind(
-    near: Singles, far: Singles, lens: Floats, x: float, y: float, z: float, spans: tuple[float, float, float],
-    block: bool,
+    near: Singles, far: Singles, lens: Floats, x: float, y: float, z: float, spans: Spans, block: bool,
 ) -> int:  # fmt: skip
     """Return whether a box is IN_FRONT of all surfaces around it, or HIDDEN: behind them all, or outside of the image.
 
@@ -315,19 +320,69 @@ def _kind(
 
 
 @inlined
-def _lower(evidence: Bytes, hits: Bytes, i0: int, i1: int, j0: int, j1: int, k0: int, k1: int) -> None:
+def _lower(evidence: Bytes, hits: Bytes, box: Box) -> None:
     """Lower the evidence of the voxels of a box that hold too few points; not below FREE."""
+    free, enough = np.int8(FREE), np.int8(ENOUGH)
+    for i in range(box[0], box[1]):
+        for j in range(box[2], box[3]):
+            row, counts = evidence[i, j, box[4] : box[5]], hits[i, j, box[4] : box[5]]
+            for k in range(len(row)):  # in a form that the compiler turns into instructions on many numbers
+                row[k] = np.int8(row[k] - ((row[k] > free) & (counts[k] != enough)))
+
+
+@inlined
+def _middle(grid: Floats, pose: Floats, box: Box) -> tuple[float, float, float]:
+    """Return the center of a box of voxels in the optical frame [m]."""
+    a = grid[0] + 0.5 * (box[0] + box[1]) * grid[3] - pose[0, 3]
+    b = grid[1] + 0.5 * (box[2] + box[3]) * grid[3] - pose[1, 3]
+    c = grid[2] + 0.5 * (box[4] + box[5]) * grid[3] - pose[2, 3]
+    x = pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c
+    y = pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c
+    return x, y, pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c
+
+
+@inlined
+def _clear_each(
+    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, grid: Floats, lens: Floats, box: Box,
+    spans: Spans,
+) -> None:  # fmt: skip
+    """Clear the voxels of a box one by one."""
+    rows, columns, hz, side = near.shape[1], near.shape[2], spans[2], grid[3]
+    for i in range(box[0], box[1]):
+        for j in range(box[2], box[3]):
+            x, y, z = _middle(grid, pose, (i, i + 1, j, j + 1, box[4], box[4] + 1))
+            for k in range(box[4], box[5]):
+                found = evidence[i, j, k]
+                if found <= FREE or hits[i, j, k] == ENOUGH:
+                    continue
+                step = (k - box[4]) * side
+                depth = z + step * pose[2, 2]
+                if depth < lens[4] + hz:
+                    continue
+                across, down, inverse = x + step * pose[2, 0], y + step * pose[2, 1], 1.0 / depth
+                u, v = (across * inverse - lens[0]) * lens[2], (down * inverse - lens[1]) * lens[3]
+                if not (0.0 <= u < columns and 0.0 <= v < rows and depth + hz < near[0, int(v), int(u)]):
+                    continue  # neither condition can hold
+                if found > UNKNOWN or _kind(near, far, lens, across, down, depth, spans, False) == IN_FRONT:
+                    evidence[i, j, k] = found - 1
+
+
+@inlined
+def _largest(evidence: Bytes, i0: int, i1: int, j0: int, j1: int, found: Bytes) -> None:
+    """Find the largest evidence of voxels of a column at each height, shape (nz,)."""
+    for k in range(len(found)):
+        found[k] = FREE
     for i in range(i0, i1):
         for j in range(j0, j1):
-            for k in range(k0, k1):
-                found = evidence[i, j, k]
-                evidence[i, j, k] = found - (1 if found > FREE and hits[i, j, k] != ENOUGH else 0)
+            row = evidence[i, j, : len(found)]
+            for k in range(len(found)):
+                found[k] = max(found[k], row[k])
 
 
 @entry_point
 def clear_voxels(
-    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, origin: Floats, side: float, lens: Floats,
-) -> None:  # fmt: skip
+    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, grid: Floats, lens: Floats, largest: Bytes
+) -> None:
     """Lower the evidence of voxels that are in front of all surfaces which the image shows where they appear.
 
     A voxel that holds no points becomes FREE step by step where it is in front of all depths of the cells that its
@@ -340,61 +395,42 @@ def clear_voxels(
         near: Least depths by :func:`cell_depths`, shape (levels, rows, columns) [m].
         far: Largest depths.
         pose: Pose of the optical frame, shape (4, 4) [m].
-        origin: Outer corner of the first voxel, shape (3,) [m].
-        side: Side of a voxel [m].
+        grid: Outer corner of the first voxel (3), and side of a voxel [m].
         lens: Corner of the first cell at depth 1 (2) and cells in a unit there (2); smallest depth of what becomes
             free, and the largest [m]; relative error of depths; errors of the camera's orientation [rad] and
             position [m].
+        largest: Room for numbers of voxels along the last axis, shape (nz,).
     """
     nx, ny, nz = evidence.shape
-    rows, columns = near.shape[1], near.shape[2]
-    hx = 0.5 * side * (abs(pose[0, 0]) + abs(pose[1, 0]) + abs(pose[2, 0]))
-    hy = 0.5 * side * (abs(pose[0, 1]) + abs(pose[1, 1]) + abs(pose[2, 1]))
-    hz = 0.5 * side * (abs(pose[0, 2]) + abs(pose[1, 2]) + abs(pose[2, 2]))
-    dx, dy, dz = pose[2, 0] * side, pose[2, 1] * side, pose[2, 2] * side
-    one = (hx, hy, hz)
+    half = 0.5 * grid[3]
+    hx = half * (abs(pose[0, 0]) + abs(pose[1, 0]) + abs(pose[2, 0]))
+    hy = half * (abs(pose[0, 1]) + abs(pose[1, 1]) + abs(pose[2, 1]))
+    hz = half * (abs(pose[0, 2]) + abs(pose[1, 2]) + abs(pose[2, 2]))
+    one = hx, hy, hz
+    many = BLOCK * hx, BLOCK * hy, BLOCK * hz
     for i0 in range(0, nx, BLOCK):
-        i1 = min(i0 + BLOCK, nx)
         for j0 in range(0, ny, BLOCK):
-            j1, start = min(j0 + BLOCK, ny), -1
+            i1, j1, start = min(i0 + BLOCK, nx), min(j0 + BLOCK, ny), -1
+            _largest(evidence, i0, i1, j0, j1, largest)
             for k0 in range(0, nz, BLOCK):
-                k1 = min(k0 + BLOCK, nz)
-                a = origin[0] + 0.5 * (i0 + i1) * side - pose[0, 3]
-                b = origin[1] + 0.5 * (j0 + j1) * side - pose[1, 3]
-                c = origin[2] + 0.5 * (k0 + k1) * side - pose[2, 3]
-                x = pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c
-                y = pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c
-                z = pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c
-                kind = _kind(near, far, lens, x, y, z, (BLOCK * hx, BLOCK * hy, BLOCK * hz), True)
+                k1, busy = min(k0 + BLOCK, nz), False
+                for k in range(k0, k1):
+                    busy = busy or largest[k] > FREE
+                if not busy:
+                    continue
+                x, y, z = _middle(grid, pose, (i0, i1, j0, j1, k0, k1))
+                kind = _kind(near, far, lens, x, y, z, many, True)
                 if kind == IN_FRONT:
                     start = k0 if start < 0 else start
                     continue
                 if start >= 0:
-                    _lower(evidence, hits, i0, i1, j0, j1, start, k0)
+                    _lower(evidence, hits, (i0, i1, j0, j1, start, k0))
                     start = -1
                 if kind == HIDDEN:
                     continue
-                x, y, z = x - 0.5 * (k1 - k0) * dx, y - 0.5 * (k1 - k0) * dy, z - 0.5 * (k1 - k0) * dz
-                for i in range(i0, i1):
-                    for j in range(j0, j1):
-                        a, b = (i - 0.5 * (i0 + i1) + 0.5) * side, (j - 0.5 * (j0 + j1) + 0.5) * side
-                        for k in range(k0, k1):
-                            found = evidence[i, j, k]
-                            if found <= FREE or hits[i, j, k] == ENOUGH:
-                                continue
-                            c = k - k0 + 0.5
-                            depth = z + pose[0, 2] * a + pose[1, 2] * b + c * dz
-                            if depth < lens[4] + hz:
-                                continue
-                            across, down = x + pose[0, 0] * a + pose[1, 0] * b + c * dx, y + pose[0, 1] * a + pose[1, 1] * b + c * dy
-                            inverse = 1.0 / depth
-                            u, v = (across * inverse - lens[0]) * lens[2], (down * inverse - lens[1]) * lens[3]
-                            if not (0.0 <= u < columns and 0.0 <= v < rows and depth + hz < near[0, int(v), int(u)]):
-                                continue
-                            if found > UNKNOWN or _kind(near, far, lens, across, down, depth, one, False) == IN_FRONT:
-                                evidence[i, j, k] = found - 1
+                _clear_each(evidence, hits, near, far, pose, grid, lens, (i0, i1, j0, j1, k0, k1), one)
             if start >= 0:
-                _lower(evidence, hits, i0, i1, j0, j1, start, nz)
+                _lower(evidence, hits, (i0, i1, j0, j1, start, nz))
 
 
 @entry_point
