@@ -8,7 +8,7 @@ import numpy as np
 
 from apex_ompl.kernel.compiled.layout import Bytes, Integers, Singles
 from apex_ompl.kernel.compiled.perception import voxels
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
 
 SPREAD = 2.507  # extent of a normal distribution whose density is that of its middle [standard deviations]
@@ -28,6 +28,7 @@ class ImageBlocks(NamedTuple):
         plane: Corner of the first block, and sides of a block, shape (2, 2) [m].
         shape: Rows and columns of blocks.
         size: Rows and columns of pixels.
+        half: Half of the largest distance between neighboring pixels [blocks].
         density: Pixels of a unit of the plane [1/m^2].
     """
 
@@ -38,6 +39,7 @@ class ImageBlocks(NamedTuple):
     plane: Array
     shape: tuple[int, int]
     size: tuple[int, int]
+    half: float
     density: float
 
     @classmethod
@@ -55,21 +57,33 @@ class ImageBlocks(NamedTuple):
         low, side = flat.min(axis=0) - 0.5 * pixel, size * pixel
         place = np.floor((flat - low) / side + 1e-9).astype(np.int64)
         columns, rows = (place.max(axis=0) + 1).tolist()
+        steps = [np.abs(np.diff(rays, axis=k)).max(axis=(0, 1), initial=0.0) / side for k in range(2)]
+        half = 0.5 * float(np.max(steps))
         block = place[:, 1] * columns + place[:, 0]
         order = np.argsort(block, kind="stable").astype(np.int64)
         counts = np.bincount(block, minlength=rows * columns)
         border = np.zeros((height, width), bool)
         border[[0, -1]] = border[:, [0, -1]] = True
         cut = np.bincount(block[border.ravel()], minlength=rows * columns) > 0
-        whole = (counts > 0) & (~cut | (counts == size * size))
+        cut &= counts != size * size
+        whole = (counts > 0) & ~cut | _enclosed((counts > 0).reshape(rows, columns), cut.reshape(rows, columns)).ravel()
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         singles = np.ascontiguousarray(flat[order], np.float32)
         plane, density = np.stack([low, side]), float(focal[0] * focal[1])
-        return cls(order, singles, first, whole.astype(np.int8), plane, (rows, columns), (height, width), density)
+        return cls(order, singles, first, whole.astype(np.int8), plane, (rows, columns), (height, width), half, density)
 
-    def depths(self, image: Array) -> Singles:
+    def depths(self, image: Array | Singles) -> Singles:
         """Return the depths of an image, shape (height, width), in the order of the pixels, shape (P,) [m]."""
         return image.astype(np.float32, copy=False).ravel()[self.order]
+
+
+def _enclosed(filled: Flags, cut: Flags) -> Flags:
+    """Return the cells without a pixel that have some in all four directions and none at the image's border around."""
+    sides = [np.logical_or.accumulate(part, axis=k) for k in range(2) for part in (filled, np.flip(filled, k))]
+    inside = ~filled & sides[0] & np.flip(sides[1], 0) & sides[2] & np.flip(sides[3], 1)
+    near = np.pad(cut, 1)
+    rows, columns = cut.shape
+    return inside & ~np.any([near[a : a + rows, b : b + columns] for a in range(3) for b in range(3)], axis=0)
 
 
 class DepthWindows(NamedTuple):
@@ -91,7 +105,7 @@ class DepthWindows(NamedTuple):
     farthest: float
 
     @classmethod
-    def of(cls, blocks: ImageBlocks, image: Array, span: tuple[float, float], missing: float) -> Self:
+    def of(cls, blocks: ImageBlocks, image: Array | Singles, span: tuple[float, float], missing: float) -> Self:
         """Return the windows of an image.
 
         Args:
@@ -124,7 +138,7 @@ class SeenPoints(NamedTuple):
 
     @classmethod
     def of(
-        cls, blocks: ImageBlocks, image: Array, spheres: Array, alike: tuple[float, float], support: int
+        cls, blocks: ImageBlocks, image: Array | Singles, spheres: Array, alike: tuple[float, float], support: int
     ) -> Self:
         """Return the points of an image.
 
@@ -199,7 +213,8 @@ class VoxelUpdate(NamedTuple):
         """Change the evidence of voxels, shape (nx, ny, nz); ``hits`` is 0 there before and after."""
         cells = self.fill(evidence, hits, points, (windows.nearest, windows.farthest))
         corner, side = windows.blocks.plane
-        lens = [*corner, *(1.0 / side), windows.nearest, windows.farthest, self.scale, self.angle, self.shift]
+        errors = self.scale, self.angle, self.shift, windows.blocks.half
+        lens = [*corner, *(1.0 / side), windows.nearest, windows.farthest, *errors]
         voxels.clear_voxels(
             evidence, hits, windows.near, windows.far, compact(self.pose), np.append(self.origin, self.side),
             np.array(lens, float), np.empty(evidence.shape[2], np.int8),

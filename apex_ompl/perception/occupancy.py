@@ -231,7 +231,7 @@ class OccupancyMap:
         windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing)
         self._change(camera, pose).apply(self.evidence, self._hits, windows, self._points(camera, image, spheres))
 
-    def _points(self, camera: Camera, image: Array, spheres: Array) -> SeenPoints:
+    def _points(self, camera: Camera, image: NDArray[Any], spheres: Array) -> SeenPoints:
         """Return the points of an image, shape (height, width) [m], that are not in spheres of the optical frame."""
         settings = self.settings
         alike = settings.spreads * camera.depth.noise, self.resolution

@@ -154,9 +154,7 @@ def by_rays(made: OccupancyMap, camera: Camera, look: Look, q: np.ndarray, held:
     spheres = made._own_spheres(q, held, look.assumed, camera.depth.noise)
     points = made._points(camera, look.depth, spheres)
     hits = np.zeros_like(made.evidence)
-    made._change(camera, look.assumed).fill(
-        made.evidence, hits, points, (camera.depth.nearest, camera.depth.farthest)
-    )
+    made._change(camera, look.assumed).fill(made.evidence, hits, points, (camera.depth.nearest, camera.depth.farthest))
     hits = (hits == ENOUGH).astype(np.int8)
     z = points.depths.astype(float)
     follow(

@@ -26,6 +26,31 @@ Box = tuple[int, int, int, int, int, int]
 Spans = tuple[float, float, float]
 
 
+@inlined
+def _filled(near: Singles, first: Integers, missing: float, i: int, j: int) -> float:
+    """Return the least depth of the 3x3 cells around one, UNSEEN where too many of their pixels have none."""
+    _, rows, columns = near.shape
+    low, gaps, count = math.inf, 0.0, 0
+    for a in range(max(i - 1, 0), min(i + 2, rows)):
+        for b in range(max(j - 1, 0), min(j + 2, columns)):
+            low, gaps = min(low, near[1, a, b]), gaps + near[2, a, b]
+            count += first[a * columns + b + 1] - first[a * columns + b]
+    return low if gaps <= missing * count else UNSEEN
+
+
+@inlined
+def _widen(near: Singles, level: int) -> None:
+    """Find the least depths of the windows of a level from those of the level below."""
+    rows, columns, half = near.shape[1], near.shape[2], 1 << (level - 1)
+    high, wide = max(rows - 2 * half + 1, 0), max(columns - 2 * half + 1, 0)
+    below, found = near[level - 1], near[level]
+    for i in range(rows):
+        for j in range(wide if i < high else 0):
+            found[i, j] = min(below[i, j], below[i, j + half], below[i + half, j], below[i + half, j + half])
+        for j in range(wide if i < high else 0, columns):
+            found[i, j] = UNSEEN
+
+
 @entry_point
 def cell_depths(
     depths: Singles, first: Integers, whole: Bytes, nearest: float, farthest: float, missing: float, near: Singles,
@@ -49,7 +74,6 @@ def cell_depths(
             rounded up [m].
     """
     levels, rows, columns = near.shape
-    least, lost = near[1], near[2]
     for i in range(rows):
         for j in range(columns):
             cell, gaps, low = i * columns + j, 0, farthest
@@ -58,36 +82,22 @@ def cell_depths(
                     low = min(low, depths[p])
                 else:
                     gaps += 1
-            least[i, j], lost[i, j] = low, gaps
+            near[1, i, j], near[2, i, j] = low, gaps
     for i in range(far.shape[0]):
         for j in range(far.shape[1]):
             far[i, j] = UNSEEN
     for i in range(rows):
         for j in range(columns):
             cell = i * columns + j
-            low, count = least[i, j], first[cell + 1] - first[cell]
-            known = whole[cell] != 0
-            if known and (count == 0 or lost[i, j] > missing * count):
-                gaps, count = 0.0, 0
-                for a in range(max(i - 1, 0), min(i + 2, rows)):
-                    for b in range(max(j - 1, 0), min(j + 2, columns)):
-                        low, gaps = min(low, least[a, b]), gaps + lost[a, b]
-                        count += first[a * columns + b + 1] - first[a * columns + b]
-                known = gaps <= missing * count
-            near[0, i, j] = low if known else UNSEEN
-            far[i // TILE, j // TILE] = max(far[i // TILE, j // TILE], near[0, i, j])
+            low, count = near[1, i, j], first[cell + 1] - first[cell]
+            if whole[cell] == 0:
+                low = UNSEEN
+            elif count == 0 or near[2, i, j] > missing * count:
+                low = _filled(near, first, missing, i, j)
+            near[0, i, j] = low
+            far[i // TILE, j // TILE] = max(far[i // TILE, j // TILE], low)
     for level in range(1, levels):
-        before, half = near[level - 1], 1 << (level - 1)
-        for i in range(rows):
-            if i + 2 * half > rows:
-                for j in range(columns):
-                    near[level, i, j] = UNSEEN
-                continue
-            for j in range(columns - 2 * half + 1):
-                a, b = min(before[i, j], before[i, j + half]), min(before[i + half, j], before[i + half, j + half])
-                near[level, i, j] = min(a, b)
-            for j in range(max(columns - 2 * half + 1, 0), columns):
-                near[level, i, j] = UNSEEN
+        _widen(near, level)
 
 
 @entry_point
@@ -177,8 +187,8 @@ def mark_inside(
 @entry_point
 def fill_voxels(
     evidence: Bytes, hits: Bytes, cells: Integers, depths: Singles, rays: Singles, inside: Bytes, nearest: float,
-    farthest: float, pose: Floats, origin: Floats, side: float, dense: float, sharp: float, share: float, least: float, gain: int,
-    most: int,
+    farthest: float, pose: Floats, origin: Floats, side: float, dense: float, sharp: float, share: float, least: float,
+    gain: int, most: int,
 ) -> None:  # fmt: skip
     """Raise the evidence of voxels that hold enough points of an image.
 
@@ -243,10 +253,10 @@ def forget_hits(hits: Bytes, cells: Integers) -> None:
 
 
 @inlined
-def _quotients(across: float, along: float, half: float, low: float, high: float) -> tuple[float, float]:
-    """Return the least and the largest quotient of numbers within ``half`` of ``across`` and from ``1 / low`` on."""
+def _quotients(across: float, half: float, near: float, far: float) -> tuple[float, float]:
+    """Return the least and the largest x / z of a box of half extent ``half`` in x; ``near`` and ``far`` are 1 / z."""
     a, b = across - half, across + half
-    return a * (low if a < 0.0 else high), b * (low if b > 0.0 else high)
+    return a * (near if a < 0.0 else far), b * (near if b > 0.0 else far)
 
 
 @inlined
@@ -255,14 +265,17 @@ def _least_depth(near: Singles, i0: int, i1: int, j0: int, j1: int) -> float:
     levels, rows, columns = near.shape
     if i0 < 0 or j0 < 0 or i1 >= rows or j1 >= columns:
         return UNSEEN
-    size, level = max(i1 - i0, j1 - j0) + 1, 0
+    size, level = min(i1 - i0, j1 - j0) + 1, 0
     while 2 << level <= size:
         level += 1
     width = 1 << level
-    if level >= levels or width > min(rows, columns):
-        return UNSEEN
-    a, b, c, d = min(i0, rows - width), max(i1 - width + 1, 0), min(j0, columns - width), max(j1 - width + 1, 0)
-    return min(min(near[level, a, c], near[level, a, d]), min(near[level, b, c], near[level, b, d]))
+    i, j = i1 - width + 1, j1 - width + 1
+    found = min(near[level, i0, j0], near[level, i0, j], near[level, i, j0], near[level, i, j])
+    if max(i - i0, j - j0) > width:
+        for a in range(i0, i1 + 1, width):
+            for b in range(j0, j1 + 1, width):
+                found = min(found, near[level, min(a, i), min(b, j)])
+    return float(found)
 
 
 @inlined
@@ -298,13 +311,13 @@ def _kind(
     if front - shift <= 1e-3:
         return PARTLY
     low, high = 1.0 / (front - shift), 1.0 / (back + shift)
-    u0, u1 = _quotients(x, z, spans[0] + shift, low, high)
-    v0, v1 = _quotients(y, z, spans[1] + shift, low, high)
+    u0, u1 = _quotients(x, spans[0] + shift, low, high)
+    v0, v1 = _quotients(y, spans[1] + shift, low, high)
     widest, highest = max(abs(u0), abs(u1)), max(abs(v0), abs(v1))
     turn = lens[7] * (1.0 + widest * widest + highest * highest)
     rows, columns = near.shape[1], near.shape[2]
-    j0, j1 = (u0 - turn - lens[0]) * lens[2], (u1 + turn - lens[0]) * lens[2]
-    i0, i1 = (v0 - turn - lens[1]) * lens[3], (v1 + turn - lens[1]) * lens[3]
+    j0, j1 = (u0 - turn - lens[0]) * lens[2] - lens[9], (u1 + turn - lens[0]) * lens[2] + lens[9]
+    i0, i1 = (v0 - turn - lens[1]) * lens[3] - lens[9], (v1 + turn - lens[1]) * lens[3] + lens[9]
     if i1 < 0.0 or j1 < 0.0 or i0 >= rows or j0 >= columns:
         return HIDDEN
     if i0 >= 0.0 and j0 >= 0.0 and i1 < rows and j1 < columns and front >= lens[4] and back <= lens[5]:
@@ -398,7 +411,7 @@ def clear_voxels(
         grid: Outer corner of the first voxel (3), and side of a voxel [m].
         lens: Corner of the first cell at depth 1 (2) and cells in a unit there (2); smallest depth of what becomes
             free, and the largest [m]; relative error of depths; errors of the camera's orientation [rad] and
-            position [m].
+            position [m]; half a pixel [cells].
         largest: Room for numbers of voxels along the last axis, shape (nz,).
     """
     nx, ny, nz = evidence.shape
