@@ -2,8 +2,8 @@
 
 A voxel is free once a frame shows that it is in front of all surfaces where it appears in the image, with the errors of
 the camera's pose; it is occupied where points of surfaces are in it. All others, those behind surfaces and those
-outside of the image among them, are unknown. Voxels are looked up in the image, in the least depths of blocks of
-pixels; no ray is followed.
+outside of the image among them, are unknown. Voxels are looked up in the image, in the least depths of windows of it;
+no ray is followed.
 """
 
 from __future__ import annotations
@@ -57,8 +57,9 @@ class OccupancySettings:
 
     Attributes:
         spreads: Standard deviations of the camera's pose and depth scale within which nothing occupied becomes free.
-        missing: Largest share of pixels without a depth in a block of the image that counts as seen.
-        block: Side of such a block [pixels].
+        missing: Largest share of pixels without a depth in a cell of the image that counts as seen, or in the 3x3 cells
+            around one, whose least depth it has then.
+        block: Side of the cells of the image in which least depths are taken [pixels].
         stride: Stride of rows and columns of the pixels whose points make voxels occupied.
         share: Share of the points that a surface across the line of sight leaves in a voxel, at its depth and with the
             noise of depths, which makes the voxel occupied.
@@ -322,7 +323,7 @@ class OccupancyMap:
 
     def blocked(
         self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
-        held: Iterable[AttachedObject] = (), margin: float = 0.01,
+        held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (),
     ) -> Flags:  # fmt: skip
         """Return the voxels that count as obstacles, shape (nx, ny, nz).
 
@@ -331,6 +332,8 @@ class OccupancyMap:
             start: Start of the robot, shape (dof,), from which it must be able to move; needed with ``blocked``.
             held: Objects that it holds there.
             margin: Distance from robot and held objects within which unknown voxels do not count [m].
+            assume_free: Boxes in the world whose unknown voxels do not count, as the user knows them to be empty: least
+                and largest corners, shape (B, 2, 3) [m]. Voxels with their centers in a box are meant.
 
         Raises:
             ParameterError: An argument is faulty, or there is no start where unknown space is blocked.
@@ -341,7 +344,22 @@ class OccupancyMap:
             return self.occupied
         if start is None:
             raise ParameterError("start", None, "the start of the plan, whose unknown voxels do not count as obstacles")
-        return np.asarray(self.occupied | (self.unknown & ~self.touched(start, held, margin)))
+        return np.asarray(
+            self.occupied | (self.unknown & ~self.touched(start, held, margin) & ~self._within(assume_free))
+        )
+
+    def _within(self, boxes: ArrayLike) -> Flags:
+        """Return the voxels with their centers in boxes in the world, shape (B, 2, 3) [m]."""
+        given, found = finite_array(boxes, "assume_free"), np.zeros(self.evidence.shape, bool)
+        if not given.size:
+            return found
+        check_array(given, ("B", 2, 3), "assume_free")
+        cells = (given - self.origin) / self.resolution - 0.5
+        first = np.clip(np.ceil(cells[:, 0] - 1e-9), 0, self.evidence.shape).astype(int)
+        last = np.clip(np.floor(cells[:, 1] + 1e-9) + 1, 0, self.evidence.shape).astype(int)
+        for low, high in zip(first, last, strict=True):
+            found[tuple(map(slice, low, high))] = True
+        return found
 
     def touched(self, state: ArrayLike, held: Iterable[AttachedObject] = (), margin: float = 0.01) -> Flags:
         """Return the voxels that are within a margin of the robot and its held objects, shape (nx, ny, nz).
@@ -374,7 +392,7 @@ class OccupancyMap:
 
     def points(
         self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
-        held: Iterable[AttachedObject] = (), margin: float = 0.01,
+        held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (),
     ) -> Array:  # fmt: skip
         """Return the centers of the voxels of :meth:`blocked`, whose arguments it has, shape (N, 3) [m].
 
@@ -384,7 +402,9 @@ class OccupancyMap:
         Raises:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
-        return self._centers(np.argwhere(self.blocked(unknown, start, held=held, margin=margin)))
+        return self._centers(
+            np.argwhere(self.blocked(unknown, start, held=held, margin=margin, assume_free=assume_free))
+        )
 
     @property
     def ball_radius(self) -> float:
@@ -393,7 +413,8 @@ class OccupancyMap:
 
     def world(
         self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
-        held: Iterable[AttachedObject] = (), margin: float = 0.01, name: str = "map", shape: Shape = "points",
+        held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (), name: str = "map",
+        shape: Shape = "points",
     ) -> tuple[Obstacle, ...]:  # fmt: skip
         """Return the voxels of :meth:`blocked`, whose other arguments it has, as an obstacle that needs no file.
 
@@ -404,6 +425,7 @@ class OccupancyMap:
             start: As there.
             held: As there.
             margin: As there.
+            assume_free: As there.
             name: Name of the obstacle.
             shape: ``points``: the balls of :meth:`points` and ``ball_radius``, which contain the voxels. ``voxels``:
                 the cubes themselves.
@@ -415,7 +437,7 @@ class OccupancyMap:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
         check_name(shape, "shape of a map", SHAPES)
-        flags = self.blocked(unknown, start, held=held, margin=margin)
+        flags = self.blocked(unknown, start, held=held, margin=margin, assume_free=assume_free)
         if not flags.any():
             return ()
         if shape == "voxels":

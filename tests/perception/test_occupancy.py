@@ -330,6 +330,48 @@ def test_worlds_block_what_is_occupied_or_not_known(arm: Robot) -> None:
     assert len(reached) == blocked.sum() and (made.look_up(reached) >= 0).all()
 
 
+def test_unknown_voxels_in_boxes_that_are_assumed_free_do_not_count(arm: Robot) -> None:
+    made, box = OccupancyMap(BOUNDS, SIDE, arm), np.array([[-0.2, -0.3, 0.0], [0.4, 0.5, 0.52]])
+    made.evidence[20, 20, 10] = 1  # in the box
+    blocked = made.blocked("blocked", arm.home)
+    inside = ((centers(made) > box[0]) & (centers(made) < box[1])).all(axis=-1)
+    assumed = made.blocked("blocked", arm.home, assume_free=[box, box + 9.0])
+    assert (
+        (assumed == (blocked & ~inside | made.occupied)).all() and inside[20, 20, 10] and assumed.sum() < blocked.sum()
+    )
+    assert len(made.points("blocked", arm.home, assume_free=[box])) == assumed.sum()
+
+
+def test_points_that_no_pixel_around_supports_do_not_count() -> None:
+    pose = look_at((1.5, 0.2, 0.5), (0.0, 0.0, 0.1))
+    image = true_depth(placed_bodies(ROOM), CAMERA, pose)
+    rng = np.random.default_rng(0)
+    lone = rng.random(image.shape) < 0.02
+    flying = np.where(lone & (image > 0.0), 0.4 + 1.4 * rng.random(image.shape), image)
+    counts = [map_of((flying, pose), least=1, share=0.0, stride=1, support=k).occupied.sum() for k in (0, 3)]
+    assert counts[0] > 100 and counts[1] < 0.1 * counts[0]
+
+
+def test_what_appears_is_occupied_by_the_first_image_and_what_vanishes_is_freed(arm: Robot) -> None:
+    made, joints = OccupancyMap(((-0.6, -0.8, -0.3), (0.8, 0.8, 1.3)), 0.04, arm), [arm.home, arm.home + 0.3]
+    mount = np.linalg.inv(arm.link_pose(arm.home, "lower")) @ FRONT  # a camera that goes along
+    at, count = [[0.24, 0.0, 0.1]], 0
+    views = [(q, pose) for q in joints for pose in (arm.link_pose(q, "lower") @ mount, FRONT)]
+    for q, pose in views[:2]:
+        (frame,) = frames(arm, q, ROOM, pose)
+        made.integrate(frame, held=[HELD])
+    assert made.look_up(at) < 0
+    (frame,) = frames(arm, joints[0], (*ROOM, WALL), views[0][1])
+    made.integrate(frame, held=[HELD])
+    assert made.look_up(at) == made.settings.persistence
+    while made.look_up(at) >= 0:
+        q, pose = views[count % len(views)]
+        (frame,) = frames(arm, q, ROOM, pose)
+        made.integrate(frame, held=[HELD])
+        count += 1
+        assert count <= made.settings.persistence + 1
+
+
 @pytest.mark.parametrize("unknown", ["free", "blocked"])
 def test_a_plan_among_what_was_seen_is_free_in_the_true_scene(tmp_path: Path, unknown: Any) -> None:
     problem = arm_problem(tmp_path)
@@ -418,6 +460,8 @@ FAULTS: list[tuple[Callable[[OccupancyMap, Robot], Any], str]] = [
     (lambda m, r: m.world("blocked", [0.0, 0.4, 0.6]), "robot"),
     (lambda m, r: OccupancyMap(BOUNDS, SIDE, r).touched([0.0]), "state"),
     (lambda m, r: OccupancyMap(BOUNDS, SIDE, r).touched(r.home, margin=-1.0), "margin"),
+    (lambda m, r: OccupancyMap(BOUNDS, SIDE, r).world("blocked", r.home, assume_free=[[1.0]]), "assume_free"),
+    (lambda m, r: OccupancySettings(support=9), "support"),
     (lambda m, r: m.decay(0), "steps"),
     (lambda m, r: m.clear(((0, 0, 0), (0, 0, 0))), "bounds"),
     (lambda m, r: m.look_up([1.0, 2.0]), "points"),
