@@ -3,9 +3,9 @@
 A robot at the start of a problem, with what it holds, stands in a room with walls. Cameras of 640 x 480 pixels look at
 it from three places 1.2 to 1.6 m in front; their assumed poses have errors with the standard deviations that they
 state. Images are drawn by the kernel's renderer, or are rays of MuJoCo, each with a seed of its own, and have the
-errors of a stereo camera (``benchmarks/perception/depth_rays.py``). "look-up" is ``apex_ompl.perception.OccupancyMap``; "rays"
-(with ``--rays``) follows the ray of every fourth pixel, with the same hits and the same filter of the robot, and lowers
-the evidence of the voxels on its way once an image each.
+errors of a stereo camera (``benchmarks/perception/depth_rays.py``). "look-up" is ``apex_ompl.perception.OccupancyMap``;
+"rays" (with ``--rays``) follows the ray of every fourth pixel, with the same hits and the same filter of the robot, and
+lowers the evidence of the voxels on its way once an image each.
 
 ``ms`` is CPU time of one image on one core, with the filter of the robot. "covered" is the share of the surface seen
 without noise that has an occupied voxel within a voxel of it. "off" are occupied voxels that touch no solid, or are 3
@@ -14,8 +14,8 @@ cm off. "freed" is the share of the voxels with their centers in a solid, the ro
 
 Plans are made by the default planner, with a margin of 5 cm around the start, in maps of 20 and 10 mm: from nine
 places all around at the start ("around"), or from the three places in front in six states of the robot that are free
-("sweep"); every state of the paths, 0.02 rad apart, is checked in the true scene by Coal alone. Of those that fail, "goal on
-occupied" and "goal on unknown" are those whose goal touches such voxels.
+("sweep"); every state of the paths, 0.02 rad apart, is checked in the true scene by Coal alone. Of those that fail,
+"goal on occupied" and "goal on unknown" are those whose goal touches such voxels.
 
 "update" is CPU time from a depth image of the last place to the edited world of a planner, in maps of 20 mm.
 
