@@ -2,8 +2,8 @@
 
 A voxel is free once a frame shows that it is in front of all surfaces where it appears in the image, with the errors of
 the camera's pose; it is occupied where points of surfaces are in it. All others, those behind surfaces and those
-outside of the image among them, are unknown. Voxels are looked up in the image, in the least depths of blocks of
-pixels; no ray is followed.
+outside of the image among them, are unknown. Voxels are looked up in the image, in the least depths of windows of it;
+no ray is followed.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from apex_ompl.util.validation import (
 
 SCHEMA, ROLE, KEY = "apex-ompl/occupancy/1", "occupancy map", "map"
 MOST_VOXELS = 50_000_000
-LEVELS = 16  # sizes of windows of blocks; nearer voxels, whose images are larger, are not cleared
+SAMPLED = 4  # side of the blocks in which pixels are tested against the robot [pixels]
 POLICIES, SHAPES = ("free", "blocked"), ("points", "voxels")
 
 Unknown = Literal["free", "blocked"]
@@ -57,12 +57,15 @@ class OccupancySettings:
 
     Attributes:
         spreads: Standard deviations of the camera's pose and depth scale within which nothing occupied becomes free.
-        missing: Largest share of pixels without a depth in a block of the image that counts as seen.
-        block: Side of such a block [pixels].
+        missing: Largest share of pixels without a depth in a cell of the image that counts as seen, or in the 3x3 cells
+            around one, whose least depth it has then.
+        block: Side of the cells of the image in which least depths are taken [pixels].
         stride: Stride of rows and columns of the pixels whose points make voxels occupied.
         share: Share of the points that a surface across the line of sight leaves in a voxel, at its depth and with the
             noise of depths, which makes the voxel occupied.
         least: How many of these points are the least; fewer are enough where hardly as many are to be expected.
+        support: Pixels around one, of 8, that must have about its depth for its point to count: depths at edges are
+            often those of no surface.
         persistence: Frames that must see through an occupied voxel, after one that saw it occupied, to free it.
         longest: The largest number of such frames, after many that saw it occupied.
         padding: Margin around robot and held objects inside of which points belong to them [m]; the noise of depths is
@@ -71,10 +74,11 @@ class OccupancySettings:
 
     spreads: float = 2.0
     missing: float = 0.5
-    block: int = 4
+    block: int = 2
     stride: int = 2
     share: float = 0.15
     least: int = 2
+    support: int = 3
     persistence: int = 3
     longest: int = 9
     padding: float = 0.015
@@ -91,6 +95,7 @@ class OccupancySettings:
         check_integer(self.stride, "stride", 1, 64)
         check_number(self.share, "share", 0.0, 1.0)
         check_integer(self.least, "least", 1, 100)
+        check_integer(self.support, "support", 0, 8)
         check_integer(self.persistence, "persistence", 1, 100)
         check_integer(self.longest, "longest", self.persistence, 100)
         check_number(self.padding, "padding", 0.0, 0.5)
@@ -141,6 +146,7 @@ class OccupancyMap:
         self.origin, self.resolution, self.robot = box[0].copy(), float(resolution), robot
         self.settings = settings or OccupancySettings()
         self.evidence: NDArray[np.int8] = np.zeros(tuple(np.maximum(counts, 1).astype(int).tolist()), np.int8)
+        self._hits = np.zeros_like(self.evidence)  # of the image at hand
         self._blocks: tuple[Camera, tuple[ImageBlocks, ImageBlocks]] | None = None  # of the last camera
 
     def __repr__(self) -> str:
@@ -221,12 +227,16 @@ class OccupancyMap:
     def _update(self, frame: Frame, pose: Array, spheres: Array) -> None:
         """Change the map by a frame of a camera at a pose, without what is in spheres of the optical frame."""
         camera, settings = frame.camera, self.settings
-        depth, stride = camera.depth, settings.stride
-        blocks, samples = self._blocks_of(camera)
-        image = frame.depth * depth.scale
-        windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing, LEVELS)
-        points = SeenPoints.of(samples, image[::stride, ::stride], spheres)
-        self._change(camera, pose).apply(self.evidence, windows, points)
+        depth, (blocks, _) = camera.depth, self._blocks_of(camera)
+        image = (frame.depth * depth.scale).astype(np.float32)
+        windows = DepthWindows.of(blocks, image, (depth.nearest, depth.farthest), settings.missing)
+        self._change(camera, pose).apply(self.evidence, self._hits, windows, self._points(camera, image, spheres))
+
+    def _points(self, camera: Camera, image: NDArray[Any], spheres: Array) -> SeenPoints:
+        """Return the points of an image, shape (height, width) [m], that are not in spheres of the optical frame."""
+        settings = self.settings
+        alike = settings.spreads * camera.depth.noise, self.resolution
+        return SeenPoints.of(self._blocks_of(camera)[1], image, spheres, alike, settings.support)
 
     def _change(self, camera: Camera, pose: Array) -> VoxelUpdate:
         """Return how images of a camera at a pose change the evidence."""
@@ -260,7 +270,7 @@ class OccupancyMap:
             size, stride = self.settings.block, self.settings.stride
             coarse = camera.focal[0] / stride, camera.focal[1] / stride
             blocks = ImageBlocks.of(camera.grid, camera.focal, size)
-            self._blocks = camera, (blocks, ImageBlocks.of(camera.grid[::stride, ::stride], coarse, size))
+            self._blocks = camera, (blocks, ImageBlocks.of(camera.grid[::stride, ::stride], coarse, SAMPLED))
         return self._blocks[1]
 
     def decay(self, steps: int = 1) -> None:
@@ -313,7 +323,7 @@ class OccupancyMap:
 
     def blocked(
         self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
-        held: Iterable[AttachedObject] = (), margin: float = 0.01,
+        held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (),
     ) -> Flags:  # fmt: skip
         """Return the voxels that count as obstacles, shape (nx, ny, nz).
 
@@ -322,6 +332,8 @@ class OccupancyMap:
             start: Start of the robot, shape (dof,), from which it must be able to move; needed with ``blocked``.
             held: Objects that it holds there.
             margin: Distance from robot and held objects within which unknown voxels do not count [m].
+            assume_free: Boxes in the world whose unknown voxels do not count, as the user knows them to be empty: least
+                and largest corners, shape (B, 2, 3) [m]. Voxels with their centers in a box are meant.
 
         Raises:
             ParameterError: An argument is faulty, or there is no start where unknown space is blocked.
@@ -332,7 +344,22 @@ class OccupancyMap:
             return self.occupied
         if start is None:
             raise ParameterError("start", None, "the start of the plan, whose unknown voxels do not count as obstacles")
-        return np.asarray(self.occupied | (self.unknown & ~self.touched(start, held, margin)))
+        return np.asarray(
+            self.occupied | (self.unknown & ~self.touched(start, held, margin) & ~self._within(assume_free))
+        )
+
+    def _within(self, boxes: ArrayLike) -> Flags:
+        """Return the voxels with their centers in boxes in the world, shape (B, 2, 3) [m]."""
+        given, found = finite_array(boxes, "assume_free"), np.zeros(self.evidence.shape, bool)
+        if not given.size:
+            return found
+        check_array(given, ("B", 2, 3), "assume_free")
+        cells = (given - self.origin) / self.resolution - 0.5
+        first = np.clip(np.ceil(cells[:, 0] - 1e-9), 0, self.evidence.shape).astype(int)
+        last = np.clip(np.floor(cells[:, 1] + 1e-9) + 1, 0, self.evidence.shape).astype(int)
+        for low, high in zip(first, last, strict=True):
+            found[tuple(map(slice, low, high))] = True
+        return found
 
     def touched(self, state: ArrayLike, held: Iterable[AttachedObject] = (), margin: float = 0.01) -> Flags:
         """Return the voxels that are within a margin of the robot and its held objects, shape (nx, ny, nz).
@@ -365,7 +392,7 @@ class OccupancyMap:
 
     def points(
         self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
-        held: Iterable[AttachedObject] = (), margin: float = 0.01,
+        held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (),
     ) -> Array:  # fmt: skip
         """Return the centers of the voxels of :meth:`blocked`, whose arguments it has, shape (N, 3) [m].
 
@@ -375,7 +402,9 @@ class OccupancyMap:
         Raises:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
-        return self._centers(np.argwhere(self.blocked(unknown, start, held=held, margin=margin)))
+        return self._centers(
+            np.argwhere(self.blocked(unknown, start, held=held, margin=margin, assume_free=assume_free))
+        )
 
     @property
     def ball_radius(self) -> float:
@@ -384,7 +413,8 @@ class OccupancyMap:
 
     def world(
         self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
-        held: Iterable[AttachedObject] = (), margin: float = 0.01, name: str = "map", shape: Shape = "points",
+        held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (), name: str = "map",
+        shape: Shape = "points",
     ) -> tuple[Obstacle, ...]:  # fmt: skip
         """Return the voxels of :meth:`blocked`, whose other arguments it has, as an obstacle that needs no file.
 
@@ -395,6 +425,7 @@ class OccupancyMap:
             start: As there.
             held: As there.
             margin: As there.
+            assume_free: As there.
             name: Name of the obstacle.
             shape: ``points``: the balls of :meth:`points` and ``ball_radius``, which contain the voxels. ``voxels``:
                 the cubes themselves.
@@ -406,7 +437,7 @@ class OccupancyMap:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
         check_name(shape, "shape of a map", SHAPES)
-        flags = self.blocked(unknown, start, held=held, margin=margin)
+        flags = self.blocked(unknown, start, held=held, margin=margin, assume_free=assume_free)
         if not flags.any():
             return ()
         if shape == "voxels":

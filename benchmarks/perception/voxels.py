@@ -2,24 +2,31 @@
 
 A robot at the start of a problem, with what it holds, stands in a room with walls. Cameras of 640 x 480 pixels look at
 it from three places 1.2 to 1.6 m in front; their assumed poses have errors with the standard deviations that they
-state. Images are rays of MuJoCo with the errors of a stereo camera (``benchmarks/perception/depth_rays.py``). "look-up"
-is ``apex_ompl.perception.OccupancyMap``; "rays" follows the ray of every fourth pixel, with the same hits and the same
-filter of the robot, and lowers the evidence of the voxels on its way once an image each.
+state. Images are drawn by the kernel's renderer, or are rays of MuJoCo, each with a seed of its own, and have the
+errors of a stereo camera (``benchmarks/perception/depth_rays.py``). "look-up" is ``apex_ompl.perception.OccupancyMap``;
+"rays" (with ``--rays``) follows the ray of every fourth pixel, with the same hits and the same filter of the robot, and
+lowers the evidence of the voxels on its way once an image each.
 
 ``ms`` is CPU time of one image on one core, with the filter of the robot. "covered" is the share of the surface seen
 without noise that has an occupied voxel within a voxel of it. "off" are occupied voxels that touch no solid, or are 3
 cm off. "freed" is the share of the voxels with their centers in a solid, the robot's among them, that are free.
 "sure" is the share of the voxels free by rays without errors that are free.
 
-Plans are made by the default planner in maps of 20 mm, from nine places all around, with a margin of 5 cm around the
-start; every state of the paths, 0.02 rad apart, is checked in the true scene by Coal alone.
+Plans are made by the default planner, with a margin of 5 cm around the start, in maps of 20 and 10 mm: from nine
+places all around at the start ("around"), or from the three places in front in six states of the robot that are free
+("sweep"); every state of the paths, 0.02 rad apart, is checked in the true scene by Coal alone. Of those that fail,
+"goal on occupied" and "goal on unknown" are those whose goal touches such voxels.
 
-Usage: python -m benchmarks.perception.voxels [-n 8] [--plans 8]
+"update" is CPU time from a depth image of the last place to the edited world of a planner, in maps of 20 mm.
+
+Usage: python -m benchmarks.perception.voxels [-n 50] [--plans 60] [--rays]
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import numba
@@ -27,15 +34,18 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from apex_ompl import plan, problems
+from apex_ompl import MotionPlanner, plan, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cloud_contact import signed_distances
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.kernel.voxels import ENOUGH, SeenPoints
+from apex_ompl.kernel.voxels import ENOUGH
 from apex_ompl.perception import Camera, OccupancyMap, look_at
+from apex_ompl.perception.rendering import Part, ZBuffer
+from apex_ompl.perception.surfaces import geometry_surface
+from apex_ompl.perception.synthetic import LINK_SLICES, solid_part
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
@@ -43,13 +53,15 @@ from benchmarks.perception.depth_rays import RayScene, measured
 
 DEPENDS = (
     "@planning", "apex_ompl/perception/camera.py", "apex_ompl/perception/frames.py",
-    "apex_ompl/perception/occupancy.py", "benchmarks/perception/depth_rays.py",
+    "apex_ompl/perception/occupancy.py", "apex_ompl/perception/rendering.py", "benchmarks/perception/depth_rays.py",
 )  # fmt: skip
 CAMERA = Camera(
     width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5), position_spread=0.002, angle_spread=0.0015
 )
 BOX = np.array([[-0.6, -1.2, -0.1], [1.8, 1.2, 1.5]])
 SIDES = (0.01, 0.02, 0.04)
+SEEDS = {"ZBuffer": 31, "MuJoCo": 32}
+PLAN_SEED = 33
 ROOM = (
     Obstacle(name="back_wall", box=(0.1, 6.0, 4.0), position=(-1.3, 0.0, 0.5)),
     Obstacle(name="front_wall", box=(0.1, 6.0, 4.0), position=(2.5, 0.0, 0.5)),
@@ -58,19 +70,21 @@ ROOM = (
     Obstacle(name="ground", box=(6.0, 6.0, 0.1), position=(0.0, 0.0, -0.8)),
 )
 FRONT, AROUND = (-0.7, 0.0, 0.7), tuple(np.arange(9) * 2.0 * np.pi / 9.0)
-PLANNED, MARGIN = 0.02, 0.05  # of maps that are planned in: side of a voxel, and margin of unknown space [m]
+PLANNED, MARGIN = (0.02, 0.01), 0.05  # of maps that are planned in: sides of voxels, and margin of unknown space [m]
+SWEPT = 5  # states beside the start
 SUITES = ("posts", "shelf", "clutter", "wall")
 OFF = 0.03  # [m]
 
 
 class Look(NamedTuple):
-    """An image: as it was measured and as it is, and the pose of the camera, assumed and true."""
+    """An image, as measured and as it is, poses of the camera, assumed and true, and the state of the robot."""
 
     depth: np.ndarray
     true: np.ndarray
     without_robot: np.ndarray
     assumed: np.ndarray
     pose: np.ndarray
+    state: np.ndarray
 
 
 Solid = tuple[Any, np.ndarray]
@@ -89,13 +103,40 @@ class Truth(NamedTuple):
     free: np.ndarray
 
 
+class DrawnScene:
+    """A scene that the kernel's renderer draws, as :class:`RayScene` has it by rays."""
+
+    def __init__(self, made: Robot, bodies: Sequence[Body], held: Sequence[AttachedObject]) -> None:
+        """Collect the surfaces."""
+        self.robot, self.held = made, tuple(held)
+        self._links = [
+            geometry_surface(item.geometry, item.name, LINK_SLICES) for item in made.geometry.geometryObjects
+        ]
+        placed = [world_geometry(one) for one in (*made.fixtures, *bodies)]
+        self._rest = [solid_part(shape, pose, 1, (1.0, 1.0, 1.0)) for shape, pose in placed]
+
+    def depth(self, camera: Camera, pose: np.ndarray, state: np.ndarray, robot: bool = True) -> np.ndarray:
+        """Return the true depths, shape (height, width) [m]; 0 where there is nothing."""
+        parts, made = list(self._rest), self.robot
+        if robot:
+            data = made.model.createData()
+            pin.forwardKinematics(made.model, data, made.to_pinocchio(state))
+            parts += [
+                Part(surface.at((data.oMi[item.parentJoint] * item.placement).homogeneous), 1)
+                for surface, item in zip(self._links, made.geometry.geometryObjects, strict=True)
+            ]
+            held = [(coal_geometry(one), made.link_pose(state, one.link) @ one.pose) for one in self.held]
+            parts += [solid_part(shape, at, 1, (1.0, 1.0, 1.0)) for shape, at in held]
+        return ZBuffer().draw(parts, camera, pose).depth
+
+
 def looks(
-    made: Robot, problem: Problem, q: np.ndarray, rng: np.random.Generator, directions: tuple[float, ...]
-) -> list[Look]:
-    """Return the images of a problem's start from directions around z [rad]."""
-    full = RayScene(made, [*problem.scene, *ROOM], problem.attached)
+    scene: DrawnScene | RayScene, states: Sequence[np.ndarray], rng: np.random.Generator, directions: Sequence[float],
+    alone: bool = True,
+) -> list[Look]:  # fmt: skip
+    """Return the images of a scene from directions around z [rad] in each state; ``alone``: without the robot, too."""
     found = []
-    for middle in directions:
+    for q, middle in product(states, directions):
         around, above = middle + rng.uniform(-0.2, 0.2), rng.uniform(0.2, 0.9)
         target = np.array([0.4, 0.0, 0.5]) + rng.normal(0.0, 0.05, 3)
         away = np.array([np.cos(around) * np.cos(above), np.sin(around) * np.cos(above), np.sin(above)])
@@ -103,10 +144,9 @@ def looks(
         error = pin.SE3(
             pin.exp3(CAMERA.angle_spread * rng.normal(size=3)), CAMERA.position_spread * rng.normal(size=3)
         ).homogeneous
-        true = full.depth(CAMERA, pose, q)
-        found.append(
-            Look(measured(true, CAMERA, rng), true, full.depth(CAMERA, pose, q, robot=False), pose @ error, pose)
-        )
+        true = scene.depth(CAMERA, pose, q)
+        without = scene.depth(CAMERA, pose, q, robot=False) if alone else true
+        found.append(Look(measured(true, CAMERA, rng), true, without, pose @ error, pose, q))
     return found
 
 
@@ -151,12 +191,11 @@ def follow(evidence, hits, depth, left_out, rays, pose, origin, side):  # type: 
 
 def by_rays(made: OccupancyMap, camera: Camera, look: Look, q: np.ndarray, held: tuple[AttachedObject, ...]) -> None:
     """Change a map as rays do: hits as the map has them, the way to them by :func:`follow`."""
-    stride, (_, samples) = made.settings.stride, made._blocks_of(camera)
-    points = SeenPoints.of(
-        samples, look.depth[::stride, ::stride], made._own_spheres(q, held, look.assumed, camera.depth.noise)
-    )
-    span = camera.depth.nearest, camera.depth.farthest
-    hits = (made._change(camera, look.assumed).fill(made.evidence, points, span) == ENOUGH).astype(np.int8)
+    spheres = made._own_spheres(q, held, look.assumed, camera.depth.noise)
+    points = made._points(camera, look.depth, spheres)
+    hits = np.zeros_like(made.evidence)
+    made._change(camera, look.assumed).fill(made.evidence, hits, points, (camera.depth.nearest, camera.depth.farthest))
+    hits = (hits == ENOUGH).astype(np.int8)
     z = points.depths.astype(float)
     follow(
         made.evidence, hits, z, points.left_out, points.rays, look.assumed, made.origin, made.resolution
@@ -210,12 +249,12 @@ def truth_of(made: Robot, problem: Problem, q: np.ndarray, seen: list[Look], exa
     return Truth(solids, inside, np.concatenate(surface), exact.free)
 
 
-def tested(made: Robot, problem: Problem, q: np.ndarray, seen: list[Look], side: float) -> dict[str, dict[str, Any]]:
-    """Return times and shares of both ways."""
-    held = tuple(problem.attached)
+def tested(made: Robot, problem: Problem, seen: list[Look], side: float, rays: bool) -> dict[str, dict[str, Any]]:
+    """Return times and shares, by rays as well where that is asked for."""
+    held, q = tuple(problem.attached), seen[0].state
     truth = truth_of(made, problem, q, seen, OccupancyMap(BOX, side, made))
     found: dict[str, dict[str, Any]] = {}
-    for name in ("look-up", "rays"):
+    for name in ("look-up", "rays")[: 1 + rays]:
         one = OccupancyMap(BOX, side, made)
         times = []
         for look in seen:
@@ -232,63 +271,129 @@ def tested(made: Robot, problem: Problem, q: np.ndarray, seen: list[Look], side:
 def planned(made: Robot, problem: Problem, seen: OccupancyMap, q: np.ndarray, unknown: Any) -> dict[str, Any]:
     """Return how a plan in a map went."""
     world = seen.world(unknown, q, held=problem.attached, margin=MARGIN)
-    fields = {"scene": world, "allowed": ()}
     started = time.process_time()
-    result = plan(problem.model_copy(update=fields), timeout=20.0, seed=0)
+    result = plan(problem.model_copy(update={"scene": world, "allowed": ()}), timeout=20.0, seed=0)
     spent = time.process_time() - started
-    if not result or result.path is None:
-        return {"solved": False, "reason": result.reason, "status": str(result.status), "cpu_s": spent}
-    truth = CollisionChecker(made, problem.scene, problem.attached, problem.allowed, proofs=False)
-    return {"solved": True, "free": bool(truth.are_free(result.path.sample(0.02)).all()), "cpu_s": spent}
+    if result and result.path is not None:
+        truth = CollisionChecker(made, problem.scene, problem.attached, problem.allowed, proofs=False)
+        return {"cause": "", "free": bool(truth.are_free(result.path.sample(0.02)).all()), "cpu_s": spent}
+    cause = str(result.status)
+    if cause == "INVALID_GOAL":
+        goal = np.array([{**problem.start, **(problem.goal.joints or {})}[joint] for joint in made.joint_names])
+        occupied = CollisionChecker(made, seen.world(), problem.attached, proofs=False)
+        cause = "goal on unknown" if occupied.is_free(goal) else "goal on occupied"
+    return {"cause": cause, "reason": result.reason, "cpu_s": spent}
+
+
+def swept(made: Robot, problem: Problem, q: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+    """Return the start and some states that are free."""
+    checker = CollisionChecker(made, problem.scene, problem.attached, problem.allowed)
+    states = rng.uniform(made.limits.lower, made.limits.upper, (20_000, made.dof))
+    states = q + rng.uniform(0.2, 0.6, (len(states), 1)) * (states - q)
+    found: list[np.ndarray] = [q]
+    for some in np.array_split(states, 200):
+        found += [*some[checker.are_free(some)]]
+        if len(found) > SWEPT:
+            break
+    return found[: SWEPT + 1]
+
+
+def updated(made: Robot, problem: Problem, seen: OccupancyMap, look: Look) -> float:
+    """Return the CPU time from a depth image to the edited world of a planner [ms]."""
+    planner = MotionPlanner(made)
+    for one in problem.attached:
+        planner.world.attach(one)
+    planner.world.add(*seen.world())
+    started = time.process_time()
+    seen.integrate(look.depth, CAMERA, look.assumed, look.state, problem.attached)
+    with planner.world.locked():
+        planner.world.remove("map")
+        planner.world.add(*seen.world())
+    return 1e3 * (time.process_time() - started)
+
+
+def plans_of(made: Robot, name: str, k: int) -> list[dict[str, Any]]:
+    """Return how plans of a problem went."""
+    problem, rng = problems.load(name), np.random.default_rng((PLAN_SEED, k))
+    q = np.array([problem.start[joint] for joint in made.joint_names])
+    scene = DrawnScene(made, [*problem.scene, *ROOM], problem.attached)
+    views = {
+        "around": looks(scene, [q], rng, AROUND, alone=False),
+        "sweep": looks(scene, swept(made, problem, q, rng), rng, FRONT, alone=False),
+    }
+    found = []
+    for seen, side in product(views, PLANNED):
+        kept = OccupancyMap(BOX, side, made)
+        for look in views[seen]:
+            kept.integrate(look.depth, CAMERA, look.assumed, look.state, problem.attached)
+        about = {"problem": name, "views": seen, "side": side}
+        for unknown in ("free", "blocked"):
+            found.append({**about, "unknown": unknown, **planned(made, problem, kept, q, unknown)})
+        if side == PLANNED[0]:
+            found[-1]["update_ms"] = updated(made, problem, kept, views[seen][-1])
+    return found
 
 
 def main() -> None:
     """Measure, and write the results."""
-    parser = record.parser(__doc__ or "")
-    parser.add_argument("-n", type=int, default=8, help="problems (default: %(default)s)")
-    parser.add_argument("--plans", type=int, default=8, help="problems of them that are planned (default: %(default)s)")
-    given, made, rng = parser.parse_args(), robot(), np.random.default_rng(0)
-    names = [problems.frozen_names(suite, "easy")[k] for k in range(given.n) for suite in SUITES][: given.n]
-    found: dict[tuple[str, float], list[dict[str, Any]]] = {}
-    plans: dict[str, list[dict[str, Any]]] = {"free": [], "blocked": []}
-    for count, name in enumerate(tqdm(names)):
-        problem = problems.load(name)
-        q = np.array([problem.start[joint] for joint in made.joint_names])
-        seen = looks(made, problem, q, rng, FRONT)
-        for side in SIDES:
-            for way, row in tested(made, problem, q, seen, side).items():
-                found.setdefault((way, side), []).append(row)
-        if count < given.plans:
-            kept = OccupancyMap(BOX, PLANNED, made)
-            for look in looks(made, problem, q, rng, AROUND):
-                kept.integrate(look.depth, CAMERA, look.assumed, q, problem.attached)
-            for unknown, rows in plans.items():
-                rows.append({"problem": name, **planned(made, problem, kept, q, unknown)})
+    parser = record.parser(__doc__ or "", 50, "problems of a renderer, of three images each")
+    parser.add_argument("--plans", type=int, default=60, help="problems that are planned (default: %(default)s)")
+    parser.add_argument("--rays", action="store_true", help="follow rays as well")
+    given, made = parser.parse_args(), robot()
+    names = [problems.frozen_names(suite, "easy")[k] for k in range(100) for suite in SUITES]
+    found: dict[tuple[str, str, float], list[dict[str, Any]]] = {}
+    for kind, (renderer, seed) in zip((DrawnScene, RayScene), SEEDS.items(), strict=True):
+        for k, name in enumerate(tqdm(names[: given.n], desc=renderer)):
+            problem = problems.load(name)
+            q = np.array([problem.start[joint] for joint in made.joint_names])
+            scene = kind(made, [*problem.scene, *ROOM], problem.attached)
+            seen = looks(scene, [q], np.random.default_rng((seed, k)), FRONT)
+            for side in SIDES:
+                for way, row in tested(made, problem, seen, side, given.rays).items():
+                    found.setdefault((way, renderer, side), []).append(row)
+    plans = [one for k, name in enumerate(tqdm(names[: given.plans], desc="plans")) for one in plans_of(made, name, k)]
     lines = [tables(found), "", plan_table(plans)]
-    rows = [{"way": way, "side": side, "problems": some} for (way, side), some in found.items()]
+    rows = [{"way": way, "renderer": by, "side": side, "problems": some} for (way, by, side), some in found.items()]
     record.write("perception_voxels", {"rows": rows, "plans": plans}, "\n".join(lines), n=given.n, plans=given.plans)
 
 
-def tables(found: dict[tuple[str, float], list[dict[str, Any]]]) -> str:
+def tables(found: dict[tuple[str, str, float], list[dict[str, Any]]]) -> str:
     """Return the table of times and shares, means over problems."""
     kinds = ("covered", "off", "far off", "free", "sure", "freed")
-    head = ["voxels", "mm", "ms p50", "ms worst", *[f"{kind} %" for kind in kinds]]
-    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
-    for (way, side), some in sorted(found.items(), key=lambda item: (item[0][1], item[0][0])):
+    head = ["voxels", "renderer", "mm", "N images", "ms p50", "ms p95", *[f"{kind} %" for kind in kinds]]
+    lines = [record.row(head), record.row(["---", "---", *["---:"] * (len(head) - 2)])]
+    for (way, by, side), some in sorted(found.items(), key=lambda item: (item[0][2], item[0][0], item[0][1])):
         times = np.concatenate([one["ms"] for one in some])
         shares = [f"{100.0 * np.mean([one[kind] for one in some]):.2f}" for kind in kinds]
-        lines.append(record.row([way, f"{1e3 * side:g}", f"{np.median(times):.1f}", f"{times.max():.1f}", *shares]))
+        spent = (f"{value:.1f}" for value in record.percentiles(times, 50, 95))
+        lines.append(record.row([way, by, f"{1e3 * side:g}", len(FRONT) * len(some), *spent, *shares]))
     return "\n".join(lines)
 
 
-def plan_table(plans: dict[str, list[dict[str, Any]]]) -> str:
+def plan_table(plans: list[dict[str, Any]]) -> str:
     """Return the table of plans."""
-    head = ["unknown space", "N", "solved", "free in the true scene", "CPU s p50"]
-    lines = [record.row(head), record.row(["---", *["---:"] * 4])]
-    for unknown, some in plans.items():
-        solved = [one for one in some if one["solved"]]
-        spent = f"{np.median([one['cpu_s'] for one in some]):.1f}" if some else ""
-        lines.append(record.row([unknown, len(some), len(solved), sum(one["free"] for one in solved), spent]))
+    causes = sorted({one["cause"] for one in plans} - {""})
+    head = [
+        "views",
+        "mm",
+        "unknown space",
+        "N",
+        "solved",
+        "free in the true scene",
+        *causes,
+        "CPU s p50",
+        "update ms p50",
+    ]
+    lines = [record.row(head), record.row(["---", "---:", "---", *["---:"] * (len(head) - 3)])]
+    groups = sorted({(one["views"], -one["side"], one["unknown"]) for one in plans})
+    for views, side, unknown in groups:
+        some = [one for one in plans if (one["views"], -one["side"], one["unknown"]) == (views, side, unknown)]
+        solved = [one for one in some if not one["cause"]]
+        counts = [sum(one["cause"] == cause for one in some) for cause in causes]
+        edits = [one["update_ms"] for one in some if "update_ms" in one]
+        spent = f"{np.median([one['cpu_s'] for one in some]):.1f}", f"{np.median(edits):.0f}" if edits else ""
+        cells = [views, f"{-1e3 * side:g}", unknown, len(some), len(solved), sum(one["free"] for one in solved)]
+        lines.append(record.row([*cells, *counts, *spent]))
     return "\n".join(lines)
 
 
