@@ -394,6 +394,8 @@ def _use_fits() -> None:
         ObstacleSettings,
         SeenObstacle,
         SeenTask,
+        Sight,
+        see,
         vect_align,
     )
     from apex_ompl.perception.registration import corrected
@@ -417,6 +419,8 @@ def _use_fits() -> None:
     alignment = Alignment(kind="vertical", first=attached[0].name, second=attached[1].name)
     task = vect_align(frame, robot, attached, alignment, AlignSettings(obstacles=None))
     assert isinstance(task, SeenTask) and bool(task) == (not task.reasons)
+    sight = see([frame], robot, attached, alignment)
+    assert isinstance(sight, Sight) and bool(sight) == (not sight.reasons) and len(sight.as_dict()["objects"]) == 2
 
 
 def _use_map(camera: Any) -> None:
