@@ -32,6 +32,7 @@ from apex_ompl.util.validation import check_number, check_positive, check_seed
 WIDTH = 320  # of the default cameras [pixels]
 LOW, HIGH = (-0.8, -1.2, -0.05), (1.5, 1.2, 1.6)  # corners of the space beyond which no obstacle counts [m]
 SPREAD = 0.03  # by which held objects are larger, whose red pixels are no obstacle [m]
+TURNING = TrackerSettings(births=1, of=1, power=0.2, gate=25.0)  # of obstacles that may turn around between two frames
 EARLY = 1e-6  # of a frame [s]
 
 
@@ -54,7 +55,7 @@ class CameraSensor:
 
     def __init__(
         self, eyes: Sequence[Eye], robot: Robot, attached: Sequence[AttachedObject] = (), *, rate: float = 10.0,
-        latency: float = 0.03, error: float = 0.015, obstacles: ObstacleSettings | None = None,
+        latency: float = 0.03, error: float = 0.01, obstacles: ObstacleSettings | None = None,
         tracker: TrackerSettings | None = None, registration: RegistrationSettings | None = None,
     ) -> None:  # fmt: skip
         """Set up the finder and the tracker.
@@ -133,9 +134,9 @@ class Cameras:
     cameras: tuple[Camera, ...] = field(default_factory=lambda: default_cameras(WIDTH))
     rate: float = 10.0
     latency: float = 0.03
-    error: float = 0.015
+    error: float = 0.01
     obstacles: ObstacleSettings = field(default_factory=lambda: ObstacleSettings(low=LOW, high=HIGH))
-    tracker: TrackerSettings = field(default_factory=TrackerSettings)
+    tracker: TrackerSettings = field(default_factory=lambda: TURNING)
     rendered: bool = False
     seed: int = 0
 

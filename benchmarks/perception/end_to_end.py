@@ -151,7 +151,7 @@ def cause(one: dict[str, Any]) -> str:
     """Return why a run failed, without names and numbers."""
     if one.get("checks"):
         return f"{one['outcome']}: not: {one['checks'][0]}"
-    words = re.sub(r"'[^']*':? ?|at [0-9.]+ s: .*|[-+]?[0-9][0-9.]*(?: ?(?:%|mm|m|degrees|s)\b)?", "", one["reason"])
+    words = re.sub(r"'[^']*':? ?|at [0-9.]+ s: .*|[-+]?[0-9][0-9.]*(?: ?%| ?(?:mm|m|degrees|s)\b)?", "", one["reason"])
     return f"{one['outcome']}: {' '.join(words.split(';')[0].split())}".rstrip(": ")
 
 

@@ -403,10 +403,12 @@ def _use_fits() -> None:
         ObstacleTracker,
         SeenObstacle,
         SeenTask,
+        Sight,
         TrackedObstacle,
         TrackerSettings,
         look_plan,
         look_states,
+        see,
         vect_align,
     )
     from apex_ompl.perception.registration import corrected
@@ -448,6 +450,8 @@ def _use_fits() -> None:
     )  # fmt: skip
     assert all(isinstance(one, LookState) and isinstance(one.objects[0], ObjectView) for one in looks)
     assert len(look_plan(looks)) <= 1 and all(one.names in ((), (attached[0].name,)) for one in looks)
+    sight = see([frame], robot, attached, alignment)
+    assert isinstance(sight, Sight) and bool(sight) == (not sight.reasons) and len(sight.as_dict()["objects"]) == 2
 
 
 def _use_map(camera: Any) -> None:

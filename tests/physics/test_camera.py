@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from physics import library
 from planning import cached_problem
+from support import benchmark_script
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.drivers import MujocoDriver
@@ -117,3 +118,25 @@ def test_only_boxes_and_cylinders_of_a_size_are_found() -> None:
     assert not is_findable(Obstacle(name="ball", sphere={"radius": 0.05}), looked)
     assert not is_findable(Obstacle(name="wall", box=(0.7, 0.06, 0.6)), looked)
     assert not is_findable(Obstacle(name="sheet", box=(0.2, 0.01, 0.2)), looked)
+
+
+def test_pairs_of_the_benchmark_are_counted_by_cause() -> None:
+    script = benchmark_script("perception.end_to_end")
+    names = script.pairs_of("tasks", 7)
+    assert names[0] == "stack_boxes/10001" and names[5] == "stack_boxes/10002" and len(set(names)) == 7
+    kinds = {script.label_of("worlds", name) for name in script.pairs_of("worlds", 14)}
+    assert kinds == set(script.worlds.kinds())
+    good = {"failed": False, "outcome": "DONE", "reason": "", "checks": []}
+    bad = {"failed": True, "outcome": "NOT_SEEN", "reason": "'peg' is hidden: 18 % of it can be seen", "checks": []}
+    pairs = [{"told": good, "seen": good}] * 7 + [{"told": good, "seen": bad}] * 2 + [{"told": bad, "seen": good}]
+    row = script.row("all", pairs)
+    assert row[1] == 10 and row[4:6] == [1, 2] and row[6].startswith("+10.0 (")
+    assert script.cause(bad) == "NOT_SEEN: is hidden: of it can be seen"
+    found = {"tasks": {f"peg_in_hole/{k}": pair for k, pair in enumerate(pairs)}}
+    rows, causes, text = script.tables(found)
+    assert [line[0] for line in rows] == ["peg_in_hole", "all tasks", "all"]
+    assert causes == [
+        ["told", "peg_in_hole", "NOT_SEEN: is hidden: of it can be seen", 1],
+        ["seen", "peg_in_hole", "NOT_SEEN: is hidden: of it can be seen", 2],
+    ]
+    assert "| seen | peg_in_hole |" in text
