@@ -320,7 +320,7 @@ def _hypotheses(
     if axis is None:
         return [(best.evidence, alone)]
     held, deviation = _profile(best, axis, side, patch, weights)
-    if len(held) == 1 or deviation < SHARP:
+    if len(held) < 2 or deviation <= SHARP:
         more = misfit * deviation**2 - alone.covariance[6 + axis, 6 + axis]
         return [(best.evidence, _spread(alone, axis, max(0.0, more)))]
     lengths = best.solid.size if end is not None else np.delete(best.solid.size, axis)
@@ -432,8 +432,8 @@ def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weight
     is the standard deviation of the logarithm of the length, by the costs of its neighbors.
     """
     first = best.solid.size[axis]
-    center = _held(best.solid, axis, patch.fine)
-    found, least, rises = [center], min(best.fit.cost, center.fit.cost), []
+    found: list[_Found] = []
+    least, rises = best.fit.cost, []
     for ratio in (np.exp(STEP), np.exp(-STEP)) if side == 0.0 else (np.exp(STEP),):
         solid, length = best.solid, first * ratio
         for k in range(MOST_LENGTHS):
@@ -446,7 +446,10 @@ def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weight
                 break
             found.append(one)
             solid, least, length = one.solid, min(least, one.fit.cost), length * ratio
-    return found, STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
+    deviation = STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
+    if deviation > SHARP:
+        found.append(_held(best.solid, axis, patch.fine))
+    return found, deviation
 
 
 def _odds(found: Sequence[_Found], axis: int, middle: float) -> list[float]:
@@ -665,9 +668,9 @@ def _middle(values: Array) -> float:
 
 def _extent(along: Array) -> tuple[Array, Array]:
     """Return the first and the last percentile of each column."""
-    order = np.sort(along, axis=0)
-    skipped = len(order) // 100
-    return order[skipped], order[-1 - skipped]
+    skipped, last = len(along) // 100, len(along) - 1
+    order = np.partition(along, (skipped, last - skipped), axis=0)
+    return order[skipped], order[last - skipped]
 
 
 def _cross(a: Array, b: Array) -> Array:
