@@ -8,7 +8,8 @@ into those for training, validation and tests as the suites' are.
 
 - ``moving``: obstacles do what their problem says, whatever the robot does.
 - ``popup``: a cube comes into being before a hand during the first motion (:mod:`apex_ompl.problems.world_ambushes`).
-- ``interceptor``: a cube at constant velocity would meet the first motion (the same module).
+- ``imposed``: a cube is brought into the way of the first motion, and stands (:mod:`apex_ompl.problems.world_imposed`).
+- ``interceptor``: a cube at constant velocity would meet the first motion (:mod:`apex_ompl.problems.world_ambushes`).
 - ``turning``: a cube takes a new direction every .5 to 2 s (:mod:`apex_ompl.problems.world_wanderers`).
 - ``crowd``: three cubes cross in front of the robot (the same module).
 - ``pusher``: a cube comes to the nearest link, and leaves (:mod:`apex_ompl.problems.world_ambushes`).
@@ -39,7 +40,7 @@ from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_integer, check_name, check_number
 
 MOVING_KIND = "moving"
-GENERATED = ("popup", "interceptor", "turning", "crowd", "pusher")
+GENERATED = ("popup", "imposed", "interceptor", "turning", "crowd", "pusher")
 SEED = re.compile(r"0|[1-9][0-9]{0,19}")
 
 
@@ -259,6 +260,7 @@ def load(name: str) -> DynamicEnvironment:
 def _drawn(world: WorldId) -> DynamicEnvironment:
     """Return the world of an id."""
     from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment, PusherEnvironment
+    from apex_ompl.problems.world_imposed import ImposedEnvironment
     from apex_ompl.problems.world_wanderers import WanderersEnvironment
 
     level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())
@@ -266,6 +268,8 @@ def _drawn(world: WorldId) -> DynamicEnvironment:
     name, problem, edge = str(world), problems.load(str(world.problem)), SIZES[world.size]
     if world.kind == "popup":
         return PopupEnvironment(name, problem, edge, rng)
+    if world.kind == "imposed":
+        return ImposedEnvironment(name, problem, edge, rng)
     if world.kind == "interceptor":
         return InterceptorEnvironment(name, problem, edge, rng)
     if world.kind == "pusher":

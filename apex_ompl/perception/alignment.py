@@ -25,7 +25,8 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_positive
 
 LENGTH = 0.05  # of vectors in the world [m]
-MOVED = 22.5  # squared error of six dimensions that a camera at its place exceeds once in 1000
+MOVED = (np.inf, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46, 24.32)
+"""Squared corrections that a camera at its place exceeds once in 1000, by their degrees of freedom (chi-squared)."""
 FEWEST = 60  # pixels of the robot that tell whether the camera is at its place
 
 
@@ -173,8 +174,7 @@ def _camera_reasons(given: CorrectedFrame, frame: Frame, robot: Robot, settings:
     off = inverse(frame.camera.pose_at(robot, found.state)) @ found.pose
     turn = np.arccos(np.clip((np.trace(off[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
     shift = float(np.linalg.norm(off[:3, 3]))
-    angle, place = max(frame.camera.angle_spread, 1e-6), max(frame.camera.position_spread, 1e-6)
-    if share >= settings.least_match and (turn / angle) ** 2 + (shift / place) ** 2 < MOVED:
+    if share >= settings.least_match and found.surprise < MOVED[found.freedoms]:
         return []
     return [
         f"{name!r} has moved since it was calibrated: {100 * share:.0f} % of the robot's surface is where it is "

@@ -38,16 +38,19 @@ from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
-INFLATION = {"box": 1.4, "cylinder": 1.1, "capsule": 1.1, "sphere": 1.0, "mesh": 1.6, "thin mesh": 1.1}
-"""Factors of the variances of measurements by shape, and of means of frames, which leave out flying pixels.
+INFLATION = {
+    "box": (1.19, 0.93), "cylinder": (0.83, 0.55), "capsule": (0.83, 0.55), "slender": (0.66, 0.31),
+    "sphere": (0.96, 0.68), "mesh": (1.45, 0.76), "thin mesh": (1.17, 0.67),
+}  # fmt: skip
+"""Factors of the variances of measurements by shape: of one frame, and of means of frames, without flying pixels.
 
 They make mean normalized squared errors those of chi-squared on scenes of their own (``python -m
 benchmarks.perception.held --calibrate``).
 """
-AVERAGED = 0.75
+SLENDER = 0.3  # radius over half length of cylinders and capsules below which they are slender
 THIN = 0.5  # share of the volume of its hull below which a mesh is thin
 ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in which they agree, and their least number
-MISFIT = 2.5  # mean squared error of points over that of noise above which covariances grow
+MISFIT, GROWTH = 1.2, 1.5  # mean squared error of points over that of noise above which variances grow, and its power
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
@@ -207,7 +210,7 @@ class Expected(NamedTuple):
         surface: Its surface.
         ties: Unknown of the scale along each axis, shape (3,).
         symmetry: ``AXIS``, ``BALL``, or 0.
-        inflation: Factor of the variances of its measurements.
+        inflation: Factors of the variances of its measurements, of one frame and of means of frames.
         pose: Its pose in the world, shape (4, 4) [m].
         covariance: Of a turn and a shift in the axes of the world, shape (6, 6).
     """
@@ -216,7 +219,7 @@ class Expected(NamedTuple):
     surface: Surface
     ties: Indices
     symmetry: int
-    inflation: float
+    inflation: tuple[float, float]
     pose: Array
     covariance: Array
 
@@ -331,7 +334,7 @@ class HeldObjectFinder:
         """Return the weights of points that stand for others, of pixels that share their noise in patches."""
         s = self.settings
         patch = (seen.camera.depth.correlation / window.stride) ** 2
-        inflation = one.inflation * (1.0 if seen.noise == seen.camera.depth.noise else AVERAGED)
+        inflation = one.inflation[0 if seen.noise == seen.camera.depth.noise else 1]
         return FitSettings(
             noise=seen.noise, floor=s.floor, edge=s.edge,
             point_share=s.point_share * thinning / max(1.0, patch) / inflation,
@@ -359,7 +362,7 @@ class HeldObjectFinder:
         misfit = best.cost / region.share
         if misfit > self.settings.most_misfit:
             return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
-        factor = max(1.0, misfit / MISFIT) ** 2  # of the variances of measurements
+        factor = max(1.0, misfit / MISFIT) ** GROWTH  # of the variances of measurements
         n = len(best.information)
         covariance: Array = np.zeros((n, n))
         weights = np.exp(-0.5 * np.array([fit.cost - best.cost for fit in fits]))
@@ -471,6 +474,9 @@ def _symmetry(body: AttachedObject, surface: Surface) -> int:
 
 def _shape_of(body: AttachedObject, surface: Surface) -> str:
     """Return the key of a body in ``INFLATION``."""
+    for round_body in (body.cylinder, body.capsule):
+        if round_body is not None and round_body.radius < SLENDER * round_body.length / 2.0:
+            return "slender"
     if body.shape in INFLATION and body.mesh is None:
         return body.shape
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)

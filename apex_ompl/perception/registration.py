@@ -17,6 +17,7 @@ from apex_ompl.perception.surfaces import RobotSurface
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_positive, finite_numbers
 
+TOLD = 0.1  # share of a variance that the image has to explain
 STEP = 1e-3  # of joints, for differences [rad; synergies 0..1]
 ROUNDS = ((0.06, 0.03), (0.06, 0.02), (0.05, 0.012), (0.05, 0.012))  # gate and cutoff of residuals [m]
 
@@ -58,6 +59,9 @@ class Registration(NamedTuple):
         covariance: Of turn [rad] and shift [m] of measured points in the optical frame, and of the scale, shape (7, 7).
         pixels: Number of pixels that counted, of every ``correlation``-th column and row.
         apart: Number of those whose surface is not where the robot's is expected, nor before it.
+        surprise: Squared corrections of the camera in units of those that its file lets expect, chi-squared distributed
+            where it stands as calibrated (the normalized innovation squared of a Kalman filter).
+        freedoms: Degrees of freedom of ``surprise``: what the image tells of the pose and the scale, 0 to 7.
     """
 
     pose: Array
@@ -66,6 +70,8 @@ class Registration(NamedTuple):
     covariance: Array
     pixels: int
     apart: int
+    surprise: float = 0.0
+    freedoms: int = 0
 
 
 class CorrectedFrame(NamedTuple):
@@ -135,7 +141,28 @@ def register(given: CorrectedFrame, surface: RobotSurface, settings: Registratio
     found = pose.copy()
     found[:3, :3] = pose[:3, :3] @ pin.exp3(unknowns[:3])
     found[:3, 3] = pose[:3, 3] + pose[:3, :3] @ unknowns[3:6]
-    return Registration(found, 1.0 + float(unknowns[6]), corrected, covariance[:POSE, :POSE], count, apart)
+    surprise, freedoms = _surprise(unknowns[:POSE], np.array(spreads[:POSE]), covariance[:POSE, :POSE])
+    return Registration(
+        found, 1.0 + float(unknowns[6]), corrected, covariance[:POSE, :POSE], count, apart, surprise, freedoms
+    )  # fmt: skip
+
+
+def _surprise(found: Array, spreads: Array, covariance: Array) -> tuple[float, int]:
+    """Return the squared correction in units of the expected one, and its degrees of freedom.
+
+    Without a change, corrections have the covariance before minus that after. Directions in which the image tells less
+    than ``TOLD`` of the variance do not count.
+
+    Args:
+        found: The correction, shape (7,).
+        spreads: Standard deviations before, shape (7,).
+        covariance: After, shape (7, 7).
+    """
+    scale = np.maximum(spreads, 1e-6)
+    told, axes = np.linalg.eigh(np.eye(len(found)) - covariance / np.outer(scale, scale))
+    kept = told > TOLD
+    along = axes.T @ (found / scale)
+    return float((along[kept] ** 2 / told[kept]).sum()), int(kept.sum())
 
 
 def corrected(

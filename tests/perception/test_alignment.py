@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import AlignmentGoal
-from apex_ompl.perception.alignment import AlignSettings, SeenTask, vect_align
+from apex_ompl.perception.alignment import MOVED, AlignSettings, SeenTask, vect_align
 from apex_ompl.perception.camera import look_at
 from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.registration import RegistrationSettings, corrected
+from apex_ompl.perception.surfaces import RobotSurface
 from apex_ompl.perception.synthetic import SceneGenerator, SyntheticScene, SyntheticSettings
 from apex_ompl.problems.objects import DATA
 from apex_ompl.robot import Robot
@@ -104,6 +107,24 @@ def test_a_camera_elsewhere_has_moved(scene: SyntheticScene, robot: Robot) -> No
         pose[:3, 3] += shift
         found = task(scene, robot, replace(frame, camera=frame.camera.placed(pose)))
         assert any("has moved" in reason for reason in found.reasons), shift
+
+
+def test_corrections_of_a_camera_at_its_place_are_chi_squared(robot: Robot) -> None:
+    generator, surface = SceneGenerator(robot, DATA), RobotSurface(robot)
+    total, freedoms, off = 0.0, 0, []
+    for seed in range(24):
+        frame = generator.draw(np.random.default_rng((10, seed)), SyntheticSettings()).frames[0]
+        found = corrected(frame, surface, RegistrationSettings()).registration
+        total, freedoms = total + found.surprise, freedoms + found.freedoms
+        pose = frame.camera.pose.copy()
+        pose[:3, 3] += 0.015 * np.eye(3)[seed % 3]
+        moved = replace(frame, camera=frame.camera.placed(pose))
+        again = corrected(moved, surface, RegistrationSettings()).registration
+        off.append(chi2.sf(again.surprise, again.freedoms))
+    assert freedoms >= 24 * 6
+    assert chi2.ppf(5e-4, freedoms) < total < chi2.ppf(1.0 - 5e-4, freedoms)
+    assert np.mean(np.array(off) < 1e-3) > 0.9
+    assert [chi2.ppf(0.999, n) for n in range(1, 8)] == pytest.approx(MOVED[1:], abs=0.01)
 
 
 def test_a_hidden_object_is_named(scene: SyntheticScene, robot: Robot) -> None:

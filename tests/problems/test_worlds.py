@@ -216,7 +216,7 @@ def test_before_the_beginning_obstacles_of_constant_velocity_move_and_others_sta
         assert np.allclose(before, first, atol=1e-12), kind
 
 
-@pytest.mark.parametrize("kind", ["popup", "interceptor", "pusher"])
+@pytest.mark.parametrize("kind", ["popup", "imposed", "interceptor", "pusher"])
 def test_what_is_not_decided_is_not_told(kind: str) -> None:
     world = worlds.load(f"{kind}/vertical/small/1")
     world.advance(0.1, first_motion(world)(0.0))
@@ -297,6 +297,53 @@ def test_interceptors_meet_the_motion_that_is_followed(suite: str, size: str, se
         checker.move("cube_0", present[0].position)
         touch += [] if checker.is_free(state(motion, time)) else [time]
     assert touch and touch[0] <= BEGIN + 1.5
+
+
+@several
+@given(suites, sizes, seeds)
+def test_imposed_cubes_come_into_the_way_in_time_and_stand(suite: str, size: str, seed: int) -> None:
+    world = worlds.load(f"imposed/{suite}/{size}/{seed}")
+    motion = first_motion(world)
+    end = BEGIN + motion.duration
+    seen = run(world, motion, end + 9.0)
+    check_consistency(world, seen)
+    if not world.script():
+        return
+    (made,) = world.script()
+    assert made.trajectory is not None
+    (_, *outside), (begins, *first), (stands, *there) = made.trajectory[:3]
+    assert outside == first and made.appears == begins and BEGIN < made.appears < stands <= made.appears + 1.0
+    assert 0.1 <= np.linalg.norm(np.subtract(there, first)) / (stands - made.appears) <= 0.4
+    assert first[2] == there[2]
+    checker, touched = exact(world, cube("cube_0", SIZES[size], np.array(there))), []
+    for goal in world.problem.goal_states(robot().joint_names):
+        assert checker.obstacle_distance(goal[None]) >= 0.03 - 1e-6
+    for time, present in seen[::2]:
+        if present and time <= end:
+            checker.move("cube_0", present[0].position)
+            touched += [] if checker.is_free(state(motion, time)) else [time]
+    assert touched and touched[0] >= made.appears + 0.5 - STEP
+    if len(made.trajectory) > 3:
+        (again, *here), (rests, *last) = made.trajectory[3:]
+        assert stands + 2.0 <= again <= stands + 5.0 + STEP and np.allclose(here, there)
+        assert 0.2 <= np.linalg.norm(np.subtract(last, here)) <= 0.5 + 1e-9
+        for time in np.linspace(again, rests, 20):
+            checker.move("cube_0", place_at(made, time))
+            assert checker.obstacle_distance(state(motion, again)[None]) >= 0.12 - 1e-6
+
+
+def test_most_imposed_cubes_are_there_before_slow_motions_and_half_are_moved_again() -> None:
+    there, again = [], []
+    for name in worlds.ids("imposed", "train", 30):
+        if name.split("/")[2] in ("small", "medium", "large"):
+            world = worlds.load(name)
+            motion = first_motion(world)
+            world.start(motion, 0.0)
+            for time in (100.0, 110.0):
+                world.advance(time, motion.positions[0])
+            there.append(len(world.script()))
+            again += [len(one.trajectory or ()) == 5 for one in world.script()]
+    assert np.mean(there) > 0.8 and 0.2 < np.mean(again) < 0.8
 
 
 def test_few_interceptors_find_no_way() -> None:
