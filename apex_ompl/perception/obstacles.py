@@ -19,7 +19,8 @@ from apex_ompl.perception.color_parts import Color, ColorPart, Mask, color_parts
 from apex_ompl.perception.library import opencv
 from apex_ompl.perception.registration import CorrectedFrame
 from apex_ompl.perception.rendering import resampled, undistorted
-from apex_ompl.perception.solid_fit import Estimate, Kind, KnownSize, Patch, Weights, fitted, patch_of
+from apex_ompl.perception.solid_fit import Estimate, KnownSize, Patch, Weights, fitted, patch_of
+from apex_ompl.perception.solid_starts import Kind
 from apex_ompl.scene.bodies import Obstacle, pose_fields
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number, check_positive

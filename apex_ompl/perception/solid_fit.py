@@ -1,7 +1,7 @@
 """Fit of boxes and cylinders of unknown pose and size to the pixels of an obstacle.
 
-Normals of its points tell how it may be turned, and their extents its size; the fit of surfaces
-(:mod:`apex_ompl.kernel.perception`) finds pose and size. Hypotheses that differ in the length that is seen least, and
+The fit of surfaces (:mod:`apex_ompl.kernel.perception`) finds pose and size from several starts
+(:mod:`apex_ompl.perception.solid_starts`). Hypotheses that differ in the length that is seen least, and
 that of a cube, are a mixture: its mean and covariance are the answer (Laplace's approximation of their evidence,
 MacKay 2003, chapter 27).
 """
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import pinocchio as pin
@@ -24,13 +24,13 @@ from apex_ompl.perception.color_parts import APART, BEFORE, PAD, ColorPart
 from apex_ompl.perception.library import opencv
 from apex_ompl.perception.registration import CorrectedFrame
 from apex_ompl.perception.rendering import lens_of
+from apex_ompl.perception.solid_starts import Kind, Solid, crosses, resized, starts
 from apex_ompl.perception.surfaces import Surface, body_surface
 from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 Mask = NDArray[np.bool_]
-Kind = Literal["box", "cylinder"]
 
 COARSE, FINE = 45, 90  # width or height of windows [pixels]
 COARSE_POINTS = 120
@@ -38,11 +38,6 @@ COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at
 COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 5, 5, 3
 RIVALS, RIVAL = 3, 1.3  # fits that are refined at most, and their largest cost over the least
 NORMALS = 150  # that are compared at most
-SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
-SQUARE = 0.5  # cosine between normals of different sides
-THICK = 0.012  # distance from a plane of its points [m]
-THIN, THICK_SHARE = 0.35, 0.8  # shares of the width of what may be the depth of a box, and of what surely is
-PAIRS = np.random.default_rng(0).random((60, 2))  # of normals whose common perpendicular may be an axis
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
 STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
@@ -104,14 +99,6 @@ class KnownSize:
             raise ParameterError("size", size.tolist(), "three positive lengths")
         object.__setattr__(self, "size", size)
         check_positive(self.spread, "spread")
-
-
-class Solid(NamedTuple):
-    """A solid: its kind, lengths, shape (3,) [m], and pose in the optical frame, shape (4, 4) [m]."""
-
-    kind: Kind
-    size: Array
-    pose: Array
 
 
 class Estimate(NamedTuple):
@@ -281,7 +268,7 @@ def _normals(grid: Array, measured: Mask) -> tuple[Array, Array]:
     rows, columns = rows[::step] + r, columns[::step] + r
     down = smooth[rows + r, columns] - smooth[rows - r, columns]
     across = smooth[rows, columns + r] - smooth[rows, columns - r]
-    normals = _crosses(down, across)
+    normals = crosses(down, across)
     normals /= np.maximum(np.sqrt((normals * normals).sum(axis=1, keepdims=True)), 1e-12)
     return smooth[rows, columns], np.asarray(normals)
 
@@ -320,7 +307,7 @@ def _hypotheses(
     if axis is None:
         return [(best.evidence, alone)]
     held, deviation = _profile(best, axis, side, patch, weights)
-    if len(held) == 1 or deviation < SHARP:
+    if len(held) < 2 or deviation <= SHARP:
         more = misfit * deviation**2 - alone.covariance[6 + axis, 6 + axis]
         return [(best.evidence, _spread(alone, axis, max(0.0, more)))]
     lengths = best.solid.size if end is not None else np.delete(best.solid.size, axis)
@@ -331,7 +318,7 @@ def _hypotheses(
 
 def _searched(patch: Patch) -> _Found | None:
     """Return the best fit from all starts."""
-    found = [_run(one, patch.coarse, COARSE_STEPS) for one in _starts(patch)]
+    found = [_run(one, patch.coarse, COARSE_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
     found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
     if not found:
         return None
@@ -414,17 +401,6 @@ def _vague_axis(one: Estimate) -> int | None:
     return int(np.argmax(spread)) if spread.max() > VAGUE else None
 
 
-def _resized(solid: Solid, axis: int, length: float, side: float = 0.0) -> Solid:
-    """Return a solid with another length along an axis, where the end on a side moves, by default that far away."""
-    pose, size = solid.pose.copy(), solid.size.copy()
-    moving = side or np.sign(pose[:3, axis] @ pose[:3, 3])
-    pose[:3, 3] += moving * (length - size[axis]) / 2.0 * pose[:3, axis]
-    size[axis] = length
-    if solid.kind == "cylinder" and axis < 2:
-        size[:2] = length
-    return Solid(solid.kind, size, pose)
-
-
 def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weights) -> tuple[list[_Found], float]:
     """Return fits with lengths along an axis that are held, of which the end on a side moves.
 
@@ -432,21 +408,24 @@ def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weight
     is the standard deviation of the logarithm of the length, by the costs of its neighbors.
     """
     first = best.solid.size[axis]
-    center = _held(best.solid, axis, patch.fine)
-    found, least, rises = [center], min(best.fit.cost, center.fit.cost), []
+    found: list[_Found] = []
+    least, rises = best.fit.cost, []
     for ratio in (np.exp(STEP), np.exp(-STEP)) if side == 0.0 else (np.exp(STEP),):
         solid, length = best.solid, first * ratio
         for k in range(MOST_LENGTHS):
             if not 0.5 * weights.smallest < length < weights.largest:
                 break
-            one = _held(_resized(solid, axis, length, side), axis, patch.fine)
+            one = _held(resized(solid, axis, length, side), axis, patch.fine)
             if k == 0:
                 rises.append(one.fit.cost - best.fit.cost)
             if not one.fit.cost < least + UNLIKELY:
                 break
             found.append(one)
             solid, least, length = one.solid, min(least, one.fit.cost), length * ratio
-    return found, STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
+    deviation = STEP / np.sqrt(max(min(rises, default=0.0), 1e-6))
+    if deviation > SHARP:
+        found.append(_held(best.solid, axis, patch.fine))
+    return found, deviation
 
 
 def _odds(found: Sequence[_Found], axis: int, middle: float) -> list[float]:
@@ -466,7 +445,7 @@ def _hidden_end(best: _Found, patch: Patch) -> tuple[int, float] | None:
     ends = []
     for axis in range(3) if best.start.kind == "box" else (2,):
         for side in (-1.0, 1.0):
-            longer = _resized(best.solid, axis, LONGER * float(best.solid.size[axis]), side)
+            longer = resized(best.solid, axis, LONGER * float(best.solid.size[axis]), side)
             ends.append((_held(longer, axis, patch.fine).fit.cost, axis, side))
     cost, axis, side = min(ends)
     return (axis, side) if cost < best.fit.cost + UNLIKELY / 2.0 else None
@@ -508,7 +487,7 @@ def _cube(best: _Found, patch: Patch) -> _Found:
     front = _front(solid)
     side = float(np.sqrt(np.delete(solid.size, front).prod()))
     return _run(
-        Solid("box", np.full(3, side), _resized(solid, front, side).pose), patch.fine, FINE_STEPS, ties=(0, 0, 0)
+        Solid("box", np.full(3, side), resized(solid, front, side).pose), patch.fine, FINE_STEPS, ties=(0, 0, 0)
     )
 
 
@@ -523,7 +502,7 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
         for size in dict.fromkeys(tuple(one.size[list(order)].tolist()) for order in orders):
             start = solid
             for axis in range(3):
-                start = _resized(start, axis, float(size[axis]))
+                start = resized(start, axis, float(size[axis]))
             prior = _prior(one.kind)
             for axis in range(3) if one.kind == "box" else (0, 2):
                 prior[6 + axis, 6 + axis] = (size[axis] / one.spread) ** 2
@@ -564,153 +543,3 @@ def mixture(parts: list[tuple[float, Estimate]]) -> Estimate | None:
     pose[:3, :3], pose[:3, 3] = pin.exp3(mean[:3]) @ best.pose[:3, :3], mean[3:6]
     scale = np.concatenate([np.ones(6), 1.0 / mean[6:]])
     return Estimate(Solid(best.kind, mean[6:], pose), covariance * np.outer(scale, scale))
-
-
-def _plane(places: Array, normals: Array) -> Array | None:
-    """Return the normal of the plane through the places of the largest group of like normals; None without normals."""
-    if not len(normals):
-        return None
-    alike = normals @ normals.T > SAME_WAY
-    group = alike[int(np.argmax(alike.sum(axis=1)))]
-    mean = normals[group].mean(axis=0)
-    mean /= np.sqrt(mean @ mean)
-    for _ in range(2):
-        height = places @ mean
-        near = group & (np.abs(height - _middle(height[group])) < THICK)
-        if np.count_nonzero(near) < 6:
-            break
-        own = places[near] - places[near].mean(axis=0)
-        found = np.linalg.eigh(own.T @ own)[1][:, 0]
-        mean = found * np.sign(found @ mean)
-    return np.asarray(mean)
-
-
-def _round_axis(normals: Array) -> Array | None:
-    """Return the axis to which most normals are perpendicular or, those of a cap, parallel (RANSAC); None for few."""
-    if len(normals) < 8:
-        return None
-    pairs = (PAIRS * len(normals)).astype(np.int64)
-    axes = _crosses(normals[pairs[:, 0]], normals[pairs[:, 1]])
-    lengths = np.sqrt((axes * axes).sum(axis=1))
-    if not (lengths > 0.3).any():
-        return None
-    axes = axes[lengths > 0.3] / lengths[lengths > 0.3, None]
-    along = np.abs(normals @ axes.T)
-    best = int(np.argmax((along < 0.2).sum(axis=0) + (along > 0.95).sum(axis=0)))
-    side = normals[along[:, best] < 0.25]
-    return np.asarray(np.linalg.eigh(side.T @ side)[1][:, 0])
-
-
-def _starts(patch: Patch) -> list[Solid]:
-    """Return boxes and cylinders from which fits start, in the optical frame."""
-    first = _plane(patch.places, patch.normals)
-    if first is None:
-        first = -patch.extent.mean(axis=0)
-        first /= np.sqrt(first @ first)
-    rest = np.abs(patch.normals @ first) < SQUARE
-    enough = np.count_nonzero(rest) > max(3.0, 0.06 * len(patch.normals))
-    second = _plane(patch.places[rest], patch.normals[rest]) if enough else None
-    frames = [_frame(first, second if second is not None else _longest(patch.extent, first))]
-    if second is None:  # one side is seen, or a round one
-        frames += [_turned(frames[0], np.pi / 4.0), _squared(patch.extent, first)]
-    starts = [one for frame in frames for one in _boxes(frame, patch)]
-    axes = [first] if second is None else [first, second]
-    round_one = _round_axis(patch.normals)
-    if round_one is not None:
-        axes.append(round_one)
-    return starts + [one for axis in axes for one in _cylinders(axis, patch)]
-
-
-def _frame(first: Array, second: Array) -> Array:
-    """Return a rotation whose x is the first vector and whose y is in the plane of both."""
-    y = second - (second @ first) * first
-    y /= np.sqrt(y @ y)
-    return np.stack([first, y, _cross(first, y)], axis=1)
-
-
-def _turned(frame: Array, angle: float) -> Array:
-    """Return a rotation turned about its x [rad]."""
-    return np.asarray(frame @ pin.exp3(np.array([angle, 0.0, 0.0])))
-
-
-def _longest(points: Array, normal: Array) -> Array:
-    """Return the direction across a normal in which points extend most."""
-    flat = points - points.mean(axis=0)
-    flat = flat - (flat @ normal)[:, None] * normal
-    return np.asarray(np.linalg.eigh(flat.T @ flat)[1][:, 2])
-
-
-def _squared(points: Array, normal: Array) -> Array:
-    """Return the rotation whose x is a normal, along the sides of the smallest rectangle around points across it."""
-    y = _longest(points, normal)
-    z = _cross(normal, y)
-    flat = np.stack([points @ y, points @ z], axis=-1).astype(np.float32)
-    angle = np.radians(opencv().minAreaRect(flat)[2])
-    return _frame(normal, np.cos(angle) * y + np.sin(angle) * z)
-
-
-def _boxes(frame: Array, patch: Patch) -> list[Solid]:
-    """Return a box of the points' extents and, where it is flat, one that is as deep as it is wide."""
-    along = patch.extent @ frame
-    low, high = _extent(along)
-    solid = _solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0)
-    share = solid.size[0] / solid.size[1:].mean()
-    return ([solid] if share > THIN else []) + ([_deep(solid, 0)] if share < THICK_SHARE else [])
-
-
-def _middle(values: Array) -> float:
-    """Return a median."""
-    return float(np.partition(values, len(values) // 2)[len(values) // 2])
-
-
-def _extent(along: Array) -> tuple[Array, Array]:
-    """Return the first and the last percentile of each column."""
-    order = np.sort(along, axis=0)
-    skipped = len(order) // 100
-    return order[skipped], order[-1 - skipped]
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return the vector product of two vectors, shape (3,); NumPy's takes ten times as long."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
-def _crosses(a: Array, b: Array) -> Array:
-    """Return the vector products of rows, shape (N, 3)."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
-
-
-def _deep(solid: Solid, axis: int) -> Solid:
-    """Return a solid at least as deep along an axis as it is wide across it."""
-    others = float(np.delete(solid.size, axis).mean())
-    return _resized(solid, axis, max(others, float(solid.size[axis])))
-
-
-def _cylinders(axis: Array, patch: Patch) -> list[Solid]:
-    """Return cylinders along an axis whose outline and front are those of the points."""
-    points = patch.extent
-    sight = points.mean(axis=0)
-    across = _cross(axis, sight)
-    seen_end = float(np.abs(axis @ sight) / np.sqrt(sight @ sight))  # cosine
-    if across @ across < 0.0004 * (sight @ sight):  # along the line of sight
-        across = _longest(points, axis)
-    across /= np.sqrt(across @ across)
-    frame = np.stack([across, _cross(axis, across), axis], axis=1)
-    along = points @ frame
-    low, high = _extent(along)
-    size, middle = np.maximum(high - low, 0.01), (high + low) / 2.0
-    away = frame.T @ sight
-    radius = float(size[0]) / 2.0
-    if seen_end < 0.8 and size[2] > 0.4 * radius:
-        middle[1] = low[1] + radius if away[1] > 0.0 else high[1] - radius
-    solid = _solid("cylinder", np.array([2.0 * radius, 2.0 * radius, size[2]]), frame, middle)
-    return [_deep(solid, 2) if seen_end > 0.6 else solid]
-
-
-def _solid(kind: Kind, size: Array, frame: Array, middle: Array) -> Solid:
-    pose = np.eye(4)
-    pose[:3, :3] = frame if np.linalg.det(frame) > 0.0 else frame * (1.0, 1.0, -1.0)
-    pose[:3, 3] = frame @ middle
-    return Solid(kind, np.maximum(size, 0.01), pose)

@@ -27,7 +27,8 @@ from apex_ompl.perception.library import assignment
 from apex_ompl.perception.obstacles import SeenObstacle, solid_obstacle
 from apex_ompl.perception.registration import CorrectedFrame
 from apex_ompl.perception.rendering import lens_of
-from apex_ompl.perception.solid_fit import Kind, KnownSize
+from apex_ompl.perception.solid_fit import KnownSize
+from apex_ompl.perception.solid_starts import Kind
 from apex_ompl.perception.surfaces import inverse
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array, Indices

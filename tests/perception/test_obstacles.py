@@ -21,7 +21,8 @@ pytest.importorskip("cv2")
 
 from apex_ompl.perception.color_parts import Color, color_parts  # noqa: E402
 from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle  # noqa: E402
-from apex_ompl.perception.solid_fit import Estimate, KnownSize, Solid, mixture  # noqa: E402
+from apex_ompl.perception.solid_fit import Estimate, KnownSize, mixture  # noqa: E402
+from apex_ompl.perception.solid_starts import Solid  # noqa: E402
 
 CAMERA = Camera(width=320, height=240, focal=(232.0, 232.0), center=(159.5, 119.5), depth=DepthErrors())
 EYE = look_at((1.0, 0.1, 0.9), (0.3, 0.0, 0.3))

@@ -10,8 +10,9 @@ import pytest
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.perception.camera import Camera, DepthErrors, look_at
-from apex_ompl.perception.obstacles import Kind, SeenObstacle
+from apex_ompl.perception.obstacles import SeenObstacle
 from apex_ompl.perception.registration import CorrectedFrame, Registration
+from apex_ompl.perception.solid_starts import Kind
 from apex_ompl.perception.surfaces import inverse
 
 pytest.importorskip("scipy")
