@@ -23,6 +23,7 @@ from ready_made.specifications import (
     AlignmentSpecification,
     CarrySpecification,
     HandPose,
+    Point,
     ReachSpecification,
 )
 
@@ -42,14 +43,21 @@ from apex_ompl.problems.objects import DATA
 from apex_ompl.problems.suite_robot import DrawnProblem
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.scene.constraints import WORLD, Pose, PoseTolerance, RelativePose
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.util.entry_point import run_script
 
 ROOT = Path(__file__).resolve().parent.parent
 MARGIN = 0.01  # [m]
 CHAMFER = 0.006, 0.01  # width and depth of that of the hole of peg_in_hole [m]
-REGRASPS, NEAR, FAR = 1000, 0.02, 1.0  # tries of a state with other grasps, and how far they are from the state [rad]
-WIDE, FROM_LIMITS = 0.02, 0.03  # of these states: clearance [m], and distance of joints from their limits [rad]
+LINE = 200  # states of the straight line from start to goal, which collides
+PLACED = PoseTolerance(position=0.01, angle=0.05)  # of cups from their places
+REGRASPS, NEAR, FAR = 200, 0.02, 1.0  # tries of a state with other grasps, and how far they are from the state [rad]
+WIDE, FROM_LIMITS, SEEDS = (
+    0.025,
+    0.1,
+    20,
+)  # of these states: clearance [m], distance of joints from their limits [rad], searches
 
 
 def hold(robot: Robot, held: HandObjects) -> tuple[tuple[AttachedObject, ...], np.ndarray]:
@@ -182,8 +190,10 @@ def find_carried(specification: CarrySpecification) -> Problem:
     raise SystemExit("no pair of start and goal will do")
 
 
-def regrasped(problem: Problem) -> Problem:
-    """Return a problem with the poses in :data:`GRASPS`, and with states on its constraints near its own ones."""
+def regrasped(
+    problem: Problem, specification: ReachSpecification | AlignmentSpecification | CarrySpecification
+) -> Problem:
+    """Return a problem with the poses in :data:`GRASPS`, and where cups are carried with states in which they hold."""
     robot, poses, synergies, attached = load_robot(problem.robot), GRASPS.get(problem.name, {}), {}, []
     for held in problem.attached:
         if held.name not in poses:
@@ -195,23 +205,35 @@ def regrasped(problem: Problem) -> Problem:
         closed = grasp(robot, hand, attached[-1])
         synergies[str(closed.synergy_joint)] = float(np.floor(closed.synergy * 1e3) / 1e3)
     made = problem.model_copy(update={"attached": tuple(attached), "start": problem.start | synergies})
-    if not poses or not problem.constraints:
+    if not poses or not isinstance(specification, CarrySpecification):
         return made
-    goals = tuple(
-        named(robot, _near_on_constraints(made, q, synergies)) for q in problem.goal_states(robot.joint_names)
-    )
-    start = named(robot, _near_on_constraints(made, problem.start_state(robot.joint_names), synergies))
-    return made.model_copy(update={"start": start, "goal": Goal(joints=goals)})
+    for seed in range(SEEDS):
+        start = _with_cups(made, specification.start, problem.start_state(robot.joint_names), synergies, seed)
+        goal = None if start is None else _with_cups(made, specification.goal, start, synergies, seed)
+        if start is None or goal is None:
+            continue
+        checker = CollisionChecker(robot, made.scene, made.attached)
+        if not all(checker.is_free(start + t * (goal - start)) for t in np.linspace(0.0, 1.0, LINE)):
+            goals = Goal(joints=(named(robot, goal),))
+            return made.model_copy(update={"start": named(robot, start), "goal": goals})
+    raise SystemExit("no states will do with the other grasps")
 
 
-def _near_on_constraints(problem: Problem, q: np.ndarray, synergies: dict[str, float]) -> np.ndarray:
-    """Return a free state on the constraints of a problem near a state, with these synergies."""
-    robot, rng = load_robot(problem.robot), np.random.default_rng(0)
+def _with_cups(
+    problem: Problem, points: Sequence[Point], q: np.ndarray, synergies: dict[str, float], seed: int
+) -> np.ndarray | None:
+    """Return a free state near a state, with the middles of upright cups at points [m], and with synergies."""
+    places = []
+    for held, (x, y, z) in zip(problem.attached, points, strict=True):
+        assert held.contact is not None  # the middle of the opening, whose frame a constraint is about
+        pose = Pose(position=(x, y, z + float(np.linalg.norm(held.contact.point))))
+        places.append(RelativePose(first=WORLD, second=held.name, pose=pose, free=("rz",), tolerance=PLACED))
+    robot, rng = load_robot(problem.robot), np.random.default_rng(seed)
     hands = [robot.joint_names.index(name) for name in synergies]
     arms = [k for k in range(robot.dof) if k not in hands]
     q = q.copy()
     q[hands] = list(synergies.values())
-    bound = ConstraintSet.of(robot, problem.constraints, problem.attached, q)
+    bound = ConstraintSet.of(robot, (*problem.constraints, *places), problem.attached, q)
     checker = CollisionChecker(robot, problem.scene, problem.attached)
     for k in range(REGRASPS):
         off = rng.normal(0.0, NEAR + (FAR - NEAR) * k / REGRASPS, robot.dof)
@@ -221,7 +243,7 @@ def _near_on_constraints(problem: Problem, q: np.ndarray, synergies: dict[str, f
         room = np.minimum(state - robot.limits.lower, robot.limits.upper - state)[arms].min()
         if found.ok[0] and room > FROM_LIMITS and checker.is_free(state) and checker.clearance(state) > WIDE:
             return state
-    raise SystemExit("no state will do with the other grasps")
+    return None
 
 
 def with_relative_meshes(problem: Problem) -> Problem:
@@ -259,7 +281,7 @@ def main() -> None:
             print(name, flush=True)
             file = ROOT / specification.file
             before = load_problem(file) if file.exists() else None
-            problem = regrasped(before if given.regrasp and before else _found(specification))
+            problem = regrasped(before if given.regrasp and before else _found(specification), specification)
             after = before.after if before else ()
             with_relative_meshes(problem).model_copy(update={"after": after}).save(file)
 

@@ -54,7 +54,7 @@ class CarrySpecification:
     Attributes:
         file: File of the problem.
         scene: Its obstacles.
-        start: Middle of the tray, or grasp points of the left and the right hand [m].
+        start: Middle of the tray, or grasp points of the left and the right hand, or middles of cups in GRASPS [m].
         goal: The same at the goal.
         yaws: Of the fingers of both hands with cups, at start and goal [rad].
         seed: Of inverse kinematics.
@@ -153,7 +153,7 @@ GRASPS: Mapping[str, Mapping[str, tuple[Point, tuple[float, float, float, float]
         "full": ((-0.0184, -0.0208, -0.0494), (0.193693, 0.690061, -0.421072, 0.555875)),
     },
     "pour_upright": {
-        "left_cup": ((0.0219, -0.0202, -0.0488), (-0.310873, 0.630315, 0.387858, 0.596345)),
+        "left_cup": ((0.0219, -0.0202, -0.0488), (0.596345, 0.387858, -0.630315, 0.310873)),
         "right_cup": ((-0.0219, -0.0202, -0.0488), (0.596345, -0.387858, 0.630315, 0.310873)),
     },
 }
@@ -207,7 +207,7 @@ SPECIFICATIONS: tuple[ReachSpecification | AlignmentSpecification | CarrySpecifi
     CarrySpecification("problems/data/carry_tray.yaml", counter, ((0.5, 0.42, 0.28),), ((0.5, -0.42, 0.28),)),
     CarrySpecification(
         "problems/data/pour_upright.yaml", wall_between(0.4),
-        ((0.48, 0.3, 0.25), (0.48, -0.3, 0.25)), ((0.52, 0.07, 0.52), (0.52, -0.07, 0.7)),
+        ((0.48, 0.3, 0.25), (0.48, -0.3, 0.25)), ((0.5, 0.1, 0.455), (0.5, -0.1, 0.585)),
         ((0.4, -0.4), (-0.5, 0.5)),
     ),
 )  # fmt: skip
