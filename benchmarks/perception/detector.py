@@ -185,7 +185,7 @@ class Methods:
         expected = finder.expected(seen.registration.state)
         before = time.process_time() - started
         near = [nearest(found, one.body.name, one) for one in expected]
-        unsure = [replace_covariance(one) for one in expected]
+        unsure = [unknown(one) for one in expected]
         options: dict[str, list[Expected | None]] = {
             f"grasp x{factor} + fit": list(expected),
             f"grasp x{factor} and detector + fit": [
@@ -208,7 +208,7 @@ class Methods:
         return samples
 
 
-def replace_covariance(one: Expected) -> Expected:
+def unknown(one: Expected) -> Expected:
     """Return what is expected of an object of whose place and axis nothing is known."""
     return one._replace(covariance=np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1]))
 
@@ -280,9 +280,9 @@ def compact(found: Sequence[Sample]) -> dict[str, list[Any]]:
     def short(value: Any) -> Any:
         if not isinstance(value, float):
             return value
-        return float(f"{value:.4g}") if np.isfinite(value) else None
+        return float(f"{value:.3g}") if np.isfinite(value) else None
 
-    return {name: [short(one[name]) for one in rows] for name in rows[0]}
+    return {name: [short(one[name]) for one in rows] for name in rows[0] if name != "spent"}
 
 
 def main() -> None:
@@ -304,8 +304,8 @@ def main() -> None:
             for seed in given.seeds:
                 drawn[seed] = []
                 for k in tqdm(range(given.n), desc=f"{name} {seed}"):
-                    rng = np.random.default_rng((seed, k))
-                    drawn[seed] += methods.samples(k, generator.draw_objects(rng), rng)
+                    scene = generator.draw_objects(np.random.default_rng((seed, k)))
+                    drawn[seed] += methods.samples(k, scene, np.random.default_rng((seed, k, 1)))
             rows += errors_rows(name, drawn, given.n)
             found += [one for mine in drawn.values() for one in mine]
             false.append([name, given.n * len(given.seeds), f"{methods.false / (given.n * len(given.seeds)):.2f}"])
