@@ -1,6 +1,6 @@
 """Make the data of the detector of objects, train it, and write its checkpoint.
 
-Usage: python scripts/train_detector.py make [--frames N] [--folder FOLDER]; then ``train``; then ``save``.
+Usage: python scripts/train_detector.py make|train|save [--folder FOLDER] [--frames N] [--steps N]
 """
 
 from __future__ import annotations
