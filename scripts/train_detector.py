@@ -1,6 +1,8 @@
 """Make the data of the detector of objects, train it, and write its checkpoint.
 
-Usage: python scripts/train_detector.py make [--frames N] [--folder FOLDER]; then ``train``; then ``save``.
+Usage: python scripts/train_detector.py make [--folder FOLDER] [--frames 5000]
+       python scripts/train_detector.py train [--folder FOLDER] [--steps 4800] [--batch 8]
+       python scripts/train_detector.py save [--folder FOLDER] [--out FOLDER]
 """
 
 from __future__ import annotations

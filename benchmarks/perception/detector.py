@@ -185,7 +185,7 @@ class Methods:
         expected = finder.expected(seen.registration.state)
         before = time.process_time() - started
         near = [nearest(found, one.body.name, one) for one in expected]
-        unsure = [replace_covariance(one) for one in expected]
+        unsure = [unknown(one) for one in expected]
         options: dict[str, list[Expected | None]] = {
             f"grasp x{factor} + fit": list(expected),
             f"grasp x{factor} and detector + fit": [
@@ -208,7 +208,7 @@ class Methods:
         return samples
 
 
-def replace_covariance(one: Expected) -> Expected:
+def unknown(one: Expected) -> Expected:
     """Return what is expected of an object of whose place and axis nothing is known."""
     return one._replace(covariance=np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1]))
 
@@ -236,7 +236,10 @@ HEAD = (
     "method", "frames", "objects", "found", "center p50 mm", "center p95 mm", "axis p50 deg", "axis p95 deg", "ms p50",
     "ms p95",
 )  # fmt: skip
-SQUARED = ("kind", "objects", "found", "center p50 mm", "axis p50 deg", "squared", "within")
+SQUARED = (
+    "method, free", "kind", "objects", "found", "center p50 mm", "center p95 mm", "axis p50 deg", "axis p95 deg",
+    "squared", "within",
+)  # fmt: skip
 
 
 def errors_rows(renderer: str, drawn: dict[int, list[Sample]], n: int) -> list[list[Any]]:
@@ -258,18 +261,22 @@ def errors_rows(renderer: str, drawn: dict[int, list[Sample]], n: int) -> list[l
 
 
 def kind_rows(found: Sequence[Sample]) -> list[list[Any]]:
-    """Return the rows of detections by kind of object, of those that are seen to 85 % or more."""
+    """Return the rows of free objects by kind, of those that are seen to 85 % or more."""
     rows = []
-    for kind in sorted(KINDS):
-        mine = [one for one in found if one.method == "detector" and one.kind == kind and one.seen >= SEEN]
-        there = [one for one in mine if one.found]
-        n = 3 if kind == "ball" else 5
-        squared = np.array([one.squared for one in there])
-        center, axis = ([getattr(one, name) for one in there] for name in ("center", "axis"))
-        rows.append(
-            [kind, len(mine), f"{len(there) / max(len(mine), 1):.2f}", f"{1e3 * np.median(center):.1f}",
-             f"{np.median(axis):.1f}", f"{squared.mean() / n:.2f}", f"{np.mean(squared < CHI_SQUARED[n]):.3f}"]
-        )  # fmt: skip
+    for method in ("detector", "detector + fit"):
+        for kind in sorted(KINDS):
+            mine = [one for one in found if (one.method, one.kind) == (method, kind)]
+            mine = [one for one in mine if one.seen >= SEEN and not one.held]
+            there = [one for one in mine if one.found]
+            n = 3 if kind == "ball" else 5
+            squared = np.array([one.squared for one in there])
+            center = record.percentiles([1e3 * one.center for one in there], 50, 95)
+            axis = record.percentiles([one.axis for one in there], 50, 95)
+            own = [f"{squared.mean() / n:.2f}", f"{np.mean(squared < CHI_SQUARED[n]):.3f}"]
+            rows.append(
+                [method, kind, len(mine), f"{len(there) / max(len(mine), 1):.2f}", *(f"{v:.1f}" for v in center),
+                 *("" if kind == "ball" else f"{v:.1f}" for v in axis), *(own if method == "detector" else ("", ""))]
+            )  # fmt: skip
     return rows
 
 
@@ -280,9 +287,9 @@ def compact(found: Sequence[Sample]) -> dict[str, list[Any]]:
     def short(value: Any) -> Any:
         if not isinstance(value, float):
             return value
-        return float(f"{value:.4g}") if np.isfinite(value) else None
+        return float(f"{value:.3g}") if np.isfinite(value) else None
 
-    return {name: [short(one[name]) for one in rows] for name in rows[0]}
+    return {name: [short(one[name]) for one in rows] for name in rows[0] if name != "spent"}
 
 
 def main() -> None:
@@ -304,8 +311,8 @@ def main() -> None:
             for seed in given.seeds:
                 drawn[seed] = []
                 for k in tqdm(range(given.n), desc=f"{name} {seed}"):
-                    rng = np.random.default_rng((seed, k))
-                    drawn[seed] += methods.samples(k, generator.draw_objects(rng), rng)
+                    scene = generator.draw_objects(np.random.default_rng((seed, k)))
+                    drawn[seed] += methods.samples(k, scene, np.random.default_rng((seed, k, 1)))
             rows += errors_rows(name, drawn, given.n)
             found += [one for mine in drawn.values() for one in mine]
             false.append([name, given.n * len(given.seeds), f"{methods.false / (given.n * len(given.seeds)):.2f}"])

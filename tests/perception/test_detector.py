@@ -22,6 +22,7 @@ from apex_ompl.perception.detector import (
     KINDS,
     OPEN,
     SCHEMA,
+    SHIPPED,
     SIZES,
     UNIT,
     CellVotes,
@@ -360,3 +361,26 @@ def test_torch_is_imported_by_loading_only() -> None:
     )
     done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "False"
+
+
+def test_the_detector_that_ships_finds_objects_on_tables(scenes: list[ObjectScene]) -> None:
+    detector, found, errors, total = ObjectDetector.load(), 0, [], 0
+    for scene in scenes:
+        answers = detector.find(scene.frame)
+        assert [one.score for one in answers] == sorted((one.score for one in answers), reverse=True)
+        owners = matched(scene.objects, [one.center for one in answers])
+        for k, true in enumerate(scene.objects):
+            if true.held or not true.inside or true.seen < 0.9:
+                continue
+            total += 1
+            if k in owners and answers[owners.index(k)].kind == true.kind:
+                found += 1
+                errors.append(np.linalg.norm(answers[owners.index(k)].center - true.pose[:3, 3]))
+    assert total >= 8 and found >= total // 3
+    assert np.median(errors) < 0.02
+
+
+def test_the_checkpoint_that_ships_is_small_and_has_a_card() -> None:
+    assert sum(file.stat().st_size for file in SHIPPED.iterdir()) < 1e6
+    card = (SHIPPED / "README.md").read_text()
+    assert all(f"| {kind} |" in card for kind in KINDS) and "No frame was real" in card
