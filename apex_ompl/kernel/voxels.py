@@ -83,7 +83,9 @@ def _enclosed(filled: Flags, cut: Flags) -> Flags:
     inside = ~filled & sides[0] & np.flip(sides[1], 0) & sides[2] & np.flip(sides[3], 1)
     near = np.pad(cut, 1)
     rows, columns = cut.shape
-    return inside & ~np.any([near[a : a + rows, b : b + columns] for a in range(3) for b in range(3)], axis=0)
+    return np.asarray(
+        inside & ~np.any([near[a : a + rows, b : b + columns] for a in range(3) for b in range(3)], axis=0)
+    )
 
 
 class DepthWindows(NamedTuple):

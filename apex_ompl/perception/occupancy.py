@@ -344,9 +344,8 @@ class OccupancyMap:
             return self.occupied
         if start is None:
             raise ParameterError("start", None, "the start of the plan, whose unknown voxels do not count as obstacles")
-        return np.asarray(
-            self.occupied | (self.unknown & ~self.touched(start, held, margin) & ~self._within(assume_free))
-        )
+        doubtful = self.unknown & ~self._within(assume_free)
+        return np.asarray(self.occupied | (doubtful & ~self._touched(start, held, margin, doubtful)))
 
     def _within(self, boxes: ArrayLike) -> Flags:
         """Return the voxels with their centers in boxes in the world, shape (B, 2, 3) [m]."""
@@ -374,6 +373,10 @@ class OccupancyMap:
         Raises:
             ParameterError: The state has another shape, the margin is out of range, or the map has no robot.
         """
+        return self._touched(state, held, margin, np.ones(self.evidence.shape, bool))
+
+    def _touched(self, state: ArrayLike, held: Iterable[AttachedObject], margin: float, among: Flags) -> Flags:
+        """Return the voxels of :meth:`touched` among some, shape (nx, ny, nz)."""
         checker, kept = self._checker, {one.name: one for one in held}
         q = finite_array(state, "state")
         check_array(q, (checker.robot.dof,), "state")
@@ -382,7 +385,7 @@ class OccupancyMap:
         checker.become({}, kept, ())
         spheres = checker.kernel.cover_spheres(q)
         spheres[:, 3] += within
-        found = mark_near(self.evidence.shape, self.origin, self.resolution, spheres) != 0
+        found = among & (mark_near(self.evidence.shape, self.origin, self.resolution, spheres) != 0)
         cells = np.argwhere(found)
         found[tuple(cells.T)] = on_robot(self._centers(cells), checker.robot, q, within, kept.values())
         return np.asarray(found)

@@ -279,7 +279,7 @@ def planned(made: Robot, problem: Problem, seen: OccupancyMap, q: np.ndarray, un
         return {"cause": "", "free": bool(truth.are_free(result.path.sample(0.02)).all()), "cpu_s": spent}
     cause = str(result.status)
     if cause == "INVALID_GOAL":
-        goal = np.array([{**problem.start, **(problem.goal.joints or {})}[joint] for joint in made.joint_names])
+        goal = np.array([problem.goal.joints[0][joint] for joint in made.joint_names])
         occupied = CollisionChecker(made, seen.world(), problem.attached, proofs=False)
         cause = "goal on unknown" if occupied.is_free(goal) else "goal on occupied"
     return {"cause": cause, "reason": result.reason, "cpu_s": spent}
