@@ -109,12 +109,12 @@ def _sample(scene: int, method: str, one: TrueObject, found: Any, spent: float) 
 
 
 def _with_detector(
-    frame: Frame, finder: HeldObjectFinder, detector: ObjectDetector
+    frame: Frame, finder: HeldObjectFinder, detector: ObjectDetector, surface: RobotSurface
 ) -> tuple[tuple[HeldObject, ...], float]:
     """Return the objects as found by fits that start at grasps and detections together, and the CPU time [s]."""
     started = time.process_time()
     found = detector.find(frame)
-    seen = corrected(frame, RobotSurface(finder.robot), finder.settings.registration)
+    seen = corrected(frame, surface, finder.settings.registration)
     expected = finder.expected(seen.registration.state)
     near = [nearest(found, one.body.name, one) for one in expected]
     both = [one if it is None else fused(one, it) for one, it in zip(expected, near, strict=True)]
@@ -123,7 +123,8 @@ def _with_detector(
 
 def samples(made: Robot, renderer: Renderer, seed: int, n: int) -> list[Sample]:
     """Return all objects of ``n`` scenes, found by each method."""
-    generator, found, detector = SceneGenerator(made, DATA, renderer), [], ObjectDetector.load()
+    generator, found = SceneGenerator(made, DATA, renderer), []
+    detector, surface = ObjectDetector.load(), RobotSurface(made)
     for k in tqdm(range(n), desc=f"{type(renderer).__name__} {seed}"):
         scene = generator.draw(np.random.default_rng((seed, k)), SyntheticSettings(frames=FRAMES, colors=True))
         finder = HeldObjectFinder(made, [one.reported for one in scene.objects])
@@ -134,7 +135,7 @@ def samples(made: Robot, renderer: Renderer, seed: int, n: int) -> list[Sample]:
             averaged = time.process_time()
             answer = finder.find(frame, count)
             answers[method] = answer, time.process_time() - (started if count == 1 else averaged)
-        answers[METHODS[3]] = _with_detector(scene.frames[0], finder, detector)
+        answers[METHODS[3]] = _with_detector(scene.frames[0], finder, detector, surface)
         for method, (answer, spent) in answers.items():
             found += [
                 _sample(k, method, one, its, spent)
