@@ -330,7 +330,7 @@ def plans_of(made: Robot, name: str, k: int) -> list[dict[str, Any]]:
         for unknown in ("free", "blocked"):
             found.append({**about, "unknown": unknown, **planned(made, problem, kept, q, unknown)})
         if side == PLANNED[0]:
-            found[-1]["update_ms"] = updated(made, problem, kept, views[seen][-1])
+            found[-2]["update_ms"] = updated(made, problem, kept, views[seen][-1])
     return found
 
 
