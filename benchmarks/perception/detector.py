@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -280,18 +280,6 @@ def kind_rows(found: Sequence[Sample]) -> list[list[Any]]:
     return rows
 
 
-def compact(found: Sequence[Sample]) -> dict[str, list[Any]]:
-    """Return samples for the results by their fields, numbers with four digits, those that are none as null."""
-    rows = [asdict(one) for one in found]
-
-    def short(value: Any) -> Any:
-        if not isinstance(value, float):
-            return value
-        return float(f"{value:.3g}") if np.isfinite(value) else None
-
-    return {name: [short(one[name]) for one in rows] for name in rows[0] if name != "spent"}
-
-
 def main() -> None:
     """Measure, and write the results."""
     parser = record.parser(__doc__ or "", 150, "scenes of a seed and a renderer")
@@ -317,7 +305,7 @@ def main() -> None:
             found += [one for mine in drawn.values() for one in mine]
             false.append([name, given.n * len(given.seeds), f"{methods.false / (given.n * len(given.seeds)):.2f}"])
     parts = [table(HEAD, rows), table(SQUARED, kind_rows(found)), table(("renderer", "frames", "false"), false)]
-    data = {"rows": rows, "kinds": kind_rows(found), "false": false, "samples": compact(found)}
+    data = {"rows": rows, "kinds": kind_rows(found), "false": false}
     record.write("perception_detector", data, "\n\n".join(parts), n=given.n, seeds=given.seeds)
 
 
