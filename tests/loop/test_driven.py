@@ -238,7 +238,7 @@ def test_a_robot_at_rest_is_left_alone() -> None:
     ("given", "words"),
     [({"driver": "mujco"}, "driver 'mujco', did you mean 'mujoco'"), ({"driver": 5}, "driver: expected a driver with"),
      ({"driver": "mujoco", "clock": "real"}, "driver: expected the simulated clock"),
-     ({"sensor": 5}, "sensor: expected a Sensor, or an object with read"),
+     ({"sensor": 5}, "sensor: expected a Sensor, an object with read"),
      ({"sensor": Camera(), "settings": LoopSettings(error=0.01)}, "settings: expected both, .* 'no fastest"),
      ({"tolerance": -1.0}, "tolerance"), ({"driver": "kinematic", "tolerance": float("nan")}, "tolerance")],
 )  # fmt: skip
