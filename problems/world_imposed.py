@@ -35,7 +35,7 @@ AGAIN_SHARE = 0.5  # of the cubes that are moved once more
 STANDS = (2.0, 5.0)  # before it is moved again [s]
 WAYS = (0.2, 0.5)  # that it is moved then [m]
 APART = 0.12  # of that way to the robot when it begins [m]
-STEP = 0.02  # between two places of a way that are looked at [m]
+STEP, MOMENT = 0.02, 0.02  # between two places and between two times that are looked at [m, s]
 
 
 class _Coming(NamedTuple):
@@ -124,8 +124,8 @@ class ImposedEnvironment(AmbushEnvironment):
         return _Coming(begins, here, stands, there)
 
     def _times(self, first: float, last: float) -> list[float]:
-        """Return times between two, between which the cube moves by ``STEP`` at most [s]."""
-        times: list[float] = np.linspace(first, last, 2 + math.ceil((last - first) * self.fastest / STEP)).tolist()
+        """Return times between two, ``MOMENT`` apart at most [s]."""
+        times: list[float] = np.linspace(first, last, 2 + math.ceil((last - first) / MOMENT)).tolist()
         return times
 
     def _next(self, here: Array, q: Array) -> Array:

@@ -119,7 +119,7 @@ def test_paths_join_the_start_and_goals_and_joints_that_stay_do_so(limited: Limi
 
 
 def test_goals_in_the_workspace_are_sampled_again(limited: Limited) -> None:
-    problem, tried = load_problem("stack_boxes"), limited(6)
+    problem, tried = load_problem("peg_in_hole"), limited(6)
     setup = assemble(problem, robot(), seed=1)
     query = check(setup, "apex", params=ANYTIME, timeout=60.0, timing=True)
     result = time_step(prove(solve(query)))

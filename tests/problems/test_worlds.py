@@ -321,7 +321,7 @@ def test_imposed_cubes_come_into_the_way_in_time_and_stand(suite: str, size: str
     for time, present in seen[::2]:
         if present and time <= end:
             checker.move("cube_0", present[0].position)
-            touched += [] if checker.is_free(state(motion, time)) else [time]
+            touched += [] if checker.obstacle_distance(state(motion, time)[None]) > 0.0 else [time]
     assert touched and touched[0] >= made.appears + 0.5 - STEP
     if len(made.trajectory) > 3:
         (again, *here), (rests, *last) = made.trajectory[3:]
