@@ -449,13 +449,16 @@ def _use_fits() -> None:
         settings=LookSettings(proposals=8, predicted=2, rounds=1),
     )  # fmt: skip
     assert all(isinstance(one, LookState) and isinstance(one.objects[0], ObjectView) for one in looks)
-    assert len(look_plan(looks)) <= 1 and all(one.names in ((), (attached[0].name,)) for one in looks)
+    view = ObjectView(attached[0].name, 0.4, 1.0, 0.002, 0.01, "", True)
+    shown = LookState(robot.home, frame.camera.name, (view,), 0.5)
+    assert len(look_plan(looks)) <= 1 and look_plan((shown,)) == (shown,) and shown.names == (view.name,)
     sight = see([frame], robot, attached, alignment)
     assert isinstance(sight, Sight) and bool(sight) == (not sight.reasons) and len(sight.as_dict()["objects"]) == 2
 
 
 def _use_map(camera: Any) -> None:
     """Occupied and unknown space before a wall; docs/perception.md has the rest."""
+    import apex_ompl
     from apex_ompl.perception import OccupancyMap
 
     pose = camera.pose
@@ -468,6 +471,9 @@ def _use_map(camera: Any) -> None:
     assert not seen.occupied.any()
     seen.clear()
     assert seen.unknown.all()
+    robot = apex_ompl.load_robot("panda")
+    own = OccupancyMap(((-0.2, -0.2, 0.0), (0.2, 0.2, 0.4)), 0.05, robot)
+    assert own.touched(robot.home).any()
 
 
 def _use_messages(camera: Any) -> None:
