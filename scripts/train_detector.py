@@ -28,7 +28,9 @@ from apex_ompl.perception.detector import (
     OPEN,
     SCHEMA,
     SHIPPED,
+    SIZE_UNIT,
     SIZES,
+    UNIT,
     DetectorConfig,
     KindSpread,
     ObjectDetector,
@@ -38,7 +40,7 @@ from apex_ompl.perception.detector import (
     in_cells,
     ray_frames,
 )
-from apex_ompl.perception.detector_network import DetectorNetwork, Votes, folded, network_input
+from apex_ompl.perception.detector_network import FAR, DetectorNetwork, Votes, folded, network_input
 from apex_ompl.perception.detector_scenes import TRAINING, ObjectScene, ObjectSceneGenerator, SceneObject, matched
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.synthetic import SyntheticSettings, default_camera
@@ -59,7 +61,7 @@ CROP = (160, 192)  # of a frame that is trained on [pixels]
 CENTERED = 0.85  # share of these around an object
 RATE = 3e-3  # largest learning rate
 EVERY = 100  # steps from one report to the next
-UNIT, FARTHEST, SIZE_UNIT = 0.1, 1.5, 0.1  # of places [m], largest one in it, of logarithms of sizes
+FARTHEST = 1.5  # largest place that is a vote, in units of ``UNIT``
 FIELDS = 12  # kind, held, share seen, center, axis, radius, half length, label's place
 
 
@@ -194,7 +196,7 @@ def batch(items: list[dict[str, np.ndarray]]) -> dict[str, Any]:
 
     return {
         "color": torch.from_numpy(images), "depth": torch.from_numpy(depths), "kind": torch.from_numpy(kind),
-        "fine": torch.cat([channels_first(up), torch.from_numpy((near - 1.3)[:, None].astype(np.float32))], dim=1),
+        "fine": torch.cat([channels_first(up), torch.from_numpy((near - FAR)[:, None].astype(np.float32))], dim=1),
         "known": torch.from_numpy(owner != 255), "weight": torch.from_numpy(weight), "away": channels_first(away),
         "axis": channels_first(axis), "size": channels_first(size),
     }  # fmt: skip

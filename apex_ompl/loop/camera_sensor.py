@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,8 @@ from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import ParameterError
 from apex_ompl.loop.environment import Environment, Observation
 from apex_ompl.perception.camera import Camera
-from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings
+from apex_ompl.perception.obstacle_settings import ObstacleSettings
+from apex_ompl.perception.obstacles import ObstacleFinder
 from apex_ompl.perception.registration import RegistrationSettings, corrected
 from apex_ompl.perception.rendered_camera import RenderedCamera
 from apex_ompl.perception.rig import Eye, check_cameras, default_cameras, misplaced, noisy
@@ -80,20 +82,28 @@ class CameraSensor:
     __repr__ = fields_line
 
     def read(self, now: float) -> Observation | None:
-        """Return what the cameras see at a time [s], where it is time for a frame, else None."""
+        """Return what the cameras see at a time [s], where it is time for a frame, else None.
+
+        Frames have stamps on the same clock; that of the last one counts.
+
+        Raises:
+            ParameterError: A frame has no colors.
+        """
         if now < self._next - EARLY:
             return None
         self._next = (now if np.isinf(self._next) else self._next) + 1.0 / self.rate
         gone: list[str] = []
-        seen = set()
+        seen, stamp = set(), -np.inf
         for eye in self.eyes:
             frame = eye.frame()
+            if frame.color is None:
+                raise ParameterError("eyes", f"{frame.camera.name!r} without colors", "frames with colors")
+            stamp = max(stamp, frame.stamp)
             given = corrected(frame, self._surface, self._registration)
             links = [self.robot.link_pose(given.registration.state, one.link) @ one.pose for one in self.attached]
             balls = [(pose[:3, 3], radius) for pose, radius in zip(links, self._radii, strict=True)]
-            assert frame.color is not None
             found = self._finder.find(given, frame.color, balls)
-            self.tracked = self.tracker.update(now, found, given)
+            self.tracked = self.tracker.update(stamp, found, given)
             gone += self.tracker.gone
             seen |= {one.name for one in self.tracked if one.observed is not None}
         there = [one for one in self.tracked if one.name in seen]
@@ -104,7 +114,7 @@ class CameraSensor:
                 gone.append(one.name)
         errors = {one.name: self.error for one in there}
         return Observation(
-            now, now + self.latency, tuple(one.solid for one in there), errors, tuple(dict.fromkeys(gone))
+            stamp, stamp + self.latency, tuple(one.solid for one in there), errors, tuple(dict.fromkeys(gone))
         )
 
     def close(self) -> None:
@@ -151,6 +161,16 @@ class Cameras:
         check_number(self.latency, "latency", 0.0)
         check_number(self.error, "error", 0.0)
         check_seed(self.seed)
+
+    @property
+    def largest_error(self) -> float:
+        """Largest error of positions on which the guarantee rests [m]."""
+        return self.error
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what a result says of it."""
+        names = [camera.name for camera in self.cameras]
+        return {"cameras": names, "rate": self.rate, "latency": self.latency}
 
     def __call__(self, driver: Driver, environment: Environment) -> CameraSensor:
         """Return the sensor at work for a driver's robot in an environment.

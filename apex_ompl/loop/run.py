@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, closing, nullcontext
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -15,7 +15,6 @@ from apex_ompl.drivers.driver import Driver
 from apex_ompl.drivers.kinematic import KinematicDriver
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import ParameterError
-from apex_ompl.loop.camera_sensor import Cameras
 from apex_ompl.loop.clocks import cores, run_in_real_time, simulate, undisturbed, warm_up
 from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.cycle import Cycle
@@ -139,10 +138,9 @@ def _completed(
     Raises:
         ParameterError: They have none, and the sensor is the caller's.
     """
-    if isinstance(sensor, Sensor):
-        return settings.completed(sensor.largest_error, environment.fastest)
-    if isinstance(sensor, Cameras):
-        return settings.completed(sensor.error, environment.fastest)
+    largest = getattr(sensor, "largest_error", None)
+    if largest is not None:  # of a simulated sensor
+        return settings.completed(largest, environment.fastest)
     if not callable(getattr(sensor, "read", None)) and not is_factory(sensor):
         raise ParameterError("sensor", sensor, "a Sensor, an object with read(now), or a function that makes one")
     missing = [name for name in ("error", "fastest") if getattr(settings, name) is None]
@@ -171,10 +169,10 @@ def named_driver(name: str, problem: Problem, robot: Robot, clock: str) -> Drive
 
 def _noted(sensor: Sensor | LiveSensor | SensorFactory) -> dict[str, Any]:
     """Return what a result says of a sensor."""
-    if isinstance(sensor, Cameras):
-        names = [camera.name for camera in sensor.cameras]
-        return {"name": "Cameras", "cameras": names, "rate": sensor.rate, "latency": sensor.latency}
-    return asdict(sensor) if isinstance(sensor, Sensor) else {"name": type(sensor).__name__}
+    if isinstance(sensor, Sensor):
+        return asdict(sensor)
+    described: dict[str, Any] = getattr(sensor, "as_dict", dict)()
+    return {"name": type(sensor).__name__} | described
 
 
 def stream_of(
@@ -223,11 +221,14 @@ class _Run:
             ParameterError: What a function made is no sensor.
         """
         context, simulated = self.context, self.clock == SIMULATED
-        with nullcontext() if simulated else undisturbed(cores()[0]):
+        with ExitStack() as stack:
             if not simulated:
+                stack.enter_context(undisturbed(cores()[0]))
                 warm_up(context, tuple(self.environment.present(0.0)), self.seed)
             zero = driver.time
             used = _made(sensor, driver, self.environment)
+            if is_factory(sensor):
+                stack.callback(getattr(used, "close", tuple))
             stream = stream_of(used, self.environment, context.settings.watched, zero)
             cycle = Cycle(
                 self.environment, context, answers, stream, self.seed, lead=context.settings.period,

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from apex_ompl.perception.looking import ObjectView as ObjectView
     from apex_ompl.perception.looking import look_plan as look_plan
     from apex_ompl.perception.looking import look_states as look_states
+    from apex_ompl.perception.obstacle_settings import ObstacleSettings as ObstacleSettings
     from apex_ompl.perception.obstacles import ObstacleFinder as ObstacleFinder
-    from apex_ompl.perception.obstacles import ObstacleSettings as ObstacleSettings
     from apex_ompl.perception.obstacles import SeenObstacle as SeenObstacle
     from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
     from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
@@ -64,7 +64,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "hand_eye": "Calibration View calibrate",
         "held": "HeldObject HeldObjectFinder HeldSettings",
         "looking": "LookSettings LookState ObjectView look_plan look_states",
-        "obstacles": "ObstacleFinder ObstacleSettings SeenObstacle",
+        "obstacle_settings": "ObstacleSettings",
+        "obstacles": "ObstacleFinder SeenObstacle",
         "occupancy": "OccupancyMap OccupancySettings",
         "ros2_camera": "Ros2Camera",
         "solid_fit": "KnownSize",

@@ -19,7 +19,8 @@ from apex_ompl.perception.frames import Frame, looks_of, mean_frame
 from apex_ompl.perception.fusion import Sighting, fused
 from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
 from apex_ompl.perception.looking import LookSettings, LookState, World, look_states
-from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle
+from apex_ompl.perception.obstacle_settings import ObstacleSettings
+from apex_ompl.perception.obstacles import ObstacleFinder, SeenObstacle
 from apex_ompl.perception.registration import CorrectedFrame, corrected
 from apex_ompl.perception.surfaces import RobotSurface, body_surface, inverse
 from apex_ompl.robot.model import Robot

@@ -115,12 +115,9 @@ class DetectionFit:
         part, rays = depth[rows, columns], seen.camera.grid[rows, columns]
         lens = Window(window.left, window.top, part.shape[1], part.shape[0], 1).lens(lens_of(seen.camera))
         for surface in self._supports:
-            vertices, faces = surface.at(inverse(seen.registration.pose))
-            drawn, index = draw_triangles(vertices, faces, lens, *part.shape)
-            corners = vertices[faces]
-            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-            mine = normals[index]
+            support = surface.at(inverse(seen.registration.pose))
+            drawn, index = draw_triangles(*support, lens, *part.shape)
+            mine = support.face_normals()[index]
             slope = np.abs(mine[..., 0] * rays[..., 0] + mine[..., 1] * rays[..., 1] + mine[..., 2])
             allowed = SLACK / np.maximum(slope, LEAST_SLOPE) + 2.0 * seen.noise * part * part
             part[(index >= 0) & (part > 0.0) & (part > drawn - allowed)] = AWAY
@@ -164,7 +161,7 @@ def nearest(found: Sequence[DetectedObject], kind: str, one: Expected, within: f
     return best[1] if best is not None and best[0] < within else None
 
 
-def fused(one: Expected, found: DetectedObject) -> Expected:
+def with_detection(one: Expected, found: DetectedObject) -> Expected:
     """Return what is expected of a held object from its grasp and a detection, each by its covariance.
 
     Of kinds whose ends are the same the axis is taken the way that agrees with the grasp.

@@ -147,15 +147,7 @@ class ObjectSceneGenerator(SceneGenerator):
     def draw_objects(self, rng: np.random.Generator, settings: ObjectSettings | None = None) -> ObjectScene:
         """Return a random scene."""
         s, errors = settings or ObjectSettings(), SyntheticSettings()
-        state = self._state(rng)
-        held = [
-            self._object(rng, errors, name, side, state)
-            for name, side in zip(sorted(self.robot.hands), (-1, 1), strict=True)
-        ]
-        true_state = state.copy()
-        for name, _, kind, *_ in held:
-            k = self._synergy(name)
-            true_state[k] = np.clip(KINDS[kind].synergy + rng.normal(0.0, errors.synergy_spread), 0.0, 1.0)
+        state, true_state, held = self._hands(rng, errors)
         middle = np.mean([pose[:3, 3] for *_, pose, _ in held], axis=0)
         placed = [(kind, pose, size, body) for _, body, kind, _, pose, size in held]
         placed += self._free_objects(rng, s, middle, [(pose[:3, 3], size) for _, pose, size, _ in placed])

@@ -9,25 +9,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from apex_ompl.drivers.driver import Driver
 from apex_ompl.drivers.twin import COLORS
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.perception import draw_triangles
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame, check_camera
-from apex_ompl.perception.rendering import View, lens_of, seen_through
-from apex_ompl.perception.surfaces import RobotSurface, Surface, body_surface
+from apex_ompl.perception.rendering import Light, Part, ZBuffer, image_of, lit
+from apex_ompl.perception.rig import RED
+from apex_ompl.perception.surfaces import RobotSurface, Surface, body_surface, joined
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import Body, Obstacle, same_solid
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
 
-FURNITURE = COLORS["fixture"]  # color of what stands still
-RED = (0.8, 0.1, 0.08, 1.0)  # of other obstacles
-AMBIENT = 0.5  # share of light from all sides; the rest comes from the camera
+LIGHT = Light(direction=(0.0, 0.0, -1.0), ambient=0.5, warmth=(1.0, 1.0, 1.0), gain=1.0)  # from the camera
 SLICES = 32  # of round surfaces
 
 
@@ -72,8 +69,7 @@ class RenderedCamera:
         self._robot, self._surface = robot, RobotSurface(robot, SLICES)
         self._others, self._measured = others, measured
         self._held = [(held, body_surface(held, SLICES)) for held in problem.attached]
-        still = [body_surface(one, SLICES).at(one.pose) for one in (*robot.fixtures, *problem.still.scene)]
-        self._still = _joined(still)
+        self._still = [body_surface(one, SLICES).at(one.pose) for one in (*robot.fixtures, *problem.still.scene)]
         self._known: dict[str, tuple[Body, Surface]] = {}
 
     def __repr__(self) -> str:
@@ -88,59 +84,20 @@ class RenderedCamera:
         """
         state = self.driver.state()
         q = np.asarray(state.positions, float)
-        eye = self.camera.pose_at(self._robot, q)
-        turn, place = eye[:3, :3], eye[:3, 3]
-        links = self._surface.seen_from(eye, self._surface.poses(q))
-        held = _joined([shape.at(self._robot.link_pose(q, one.link) @ one.pose) for one, shape in self._held])
-        others = _joined([self._shape(one).at(one.pose) for one in self._others(state.stamp)])
-        parts = [Surface(links, self._surface.faces)]
-        parts += [Surface((one.vertices - place) @ turn, one.faces) for one in (self._still, held, others)]
-        view = self._view(parts)
+        links = Surface(self._surface.seen_from(np.eye(4), self._surface.poses(q)), self._surface.faces)
+        held = [shape.at(self._robot.link_pose(q, one.link) @ one.pose) for one, shape in self._held]
+        others = [self._shape(one).at(one.pose) for one in self._others(state.stamp)]
+        roles = ((COLORS["link"], [links]), (COLORS["fixture"], self._still), (COLORS["held"], held), (RED, others))
+        parts = [Part(joined(some), k, rgba[:3]) for k, (rgba, some) in enumerate(roles, 1)]
+        view = ZBuffer().draw(parts, self.camera, self.camera.pose_at(self._robot, q))
         depth, errors = view.depth, self.camera.depth
         depth = np.where((depth >= errors.nearest) & (depth <= errors.farthest), depth, 0.0) / errors.scale
         joints = dict(zip(self._robot.joint_names, q.tolist(), strict=True))
         seen = depth if self._measured is None else self._measured(depth)
-        return Frame(self.reported, seen, _shaded(view), state.stamp, joints)
-
-    def close(self) -> None:
-        """Release nothing; other cameras have something to release."""
+        return Frame(self.reported, seen, image_of(lit(view, parts, LIGHT)), state.stamp, joints)
 
     def _shape(self, body: Obstacle) -> Surface:
         known = self._known.get(body.name)
         if known is None or not same_solid(known[0], body):
             known = self._known[body.name] = body, body_surface(body, SLICES)
         return known[1]
-
-    def _view(self, parts: list[Surface]) -> View:
-        """Return depths, the numbers of the parts from 1 on, and normals."""
-        camera, all_parts = self.camera, _joined(parts)
-        label = np.repeat(np.arange(1, len(parts) + 1), [len(part.faces) for part in parts])
-        depth, index = draw_triangles(all_parts.vertices, all_parts.faces, lens_of(camera), camera.height, camera.width)
-        corners = all_parts.vertices[all_parts.faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        there = index >= 0
-        return seen_through(
-            camera,
-            View(
-                np.where(there, depth, 0.0), np.where(there, label[index], 0),
-                np.where(there[..., None], normals[index], 0.0),
-            ),
-        )  # fmt: skip
-
-
-def _joined(parts: list[Surface]) -> Surface:
-    """Return surfaces as one."""
-    firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    vertices = [np.empty((0, 3)), *(part.vertices for part in parts)]
-    faces = [np.empty((0, 3), np.int64), *(part.faces + first for part, first in zip(parts, firsts, strict=False))]
-    return Surface(np.concatenate(vertices), np.concatenate(faces))
-
-
-def _shaded(view: View) -> NDArray[np.uint8]:
-    """Return colors by the number of the part, lit from the camera, shape (height, width, 3)."""
-    names = [COLORS["floor"], COLORS["link"], FURNITURE, COLORS["held"], RED]
-    table = np.array([rgba[:3] for rgba in names])
-    shade = AMBIENT + (1.0 - AMBIENT) * np.abs(view.normals[..., 2])
-    image = table[view.labels] * shade[..., None]
-    return np.asarray((255.0 * image.clip(0.0, 1.0)).round().astype(np.uint8))

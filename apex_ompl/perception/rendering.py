@@ -21,7 +21,7 @@ from apex_ompl.drivers.geoms import geom_shapes
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.kernel.perception import draw_triangles
 from apex_ompl.perception.camera import Camera
-from apex_ompl.perception.surfaces import Surface
+from apex_ompl.perception.surfaces import Surface, joined
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number
 
@@ -122,19 +122,18 @@ class ZBuffer:
 
     def draw(self, parts: Sequence[Part], camera: Camera, pose: Array) -> View:
         """Return what a camera at a pose sees."""
-        vertices, faces, labels = _together(parts)
-        seen = vertices @ pose[:3, :3] - pose[:3, 3] @ pose[:3, :3]
-        depth, index = draw_triangles(seen, faces, lens_of(camera), camera.height, camera.width)
-        corners = seen[faces]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        together = joined([part.surface for part in parts])
+        labels = np.repeat([part.label for part in parts], [len(part.surface.faces) for part in parts])
+        seen = Surface(together.vertices @ pose[:3, :3] - pose[:3, 3] @ pose[:3, :3], together.faces)
+        depth, index = draw_triangles(*seen, lens_of(camera), camera.height, camera.width)
+        normals = seen.face_normals()
         there = index >= 0
         view = View(
             np.where(there, depth, 0.0),
             np.where(there, labels[index], 0),
             np.where(there[..., None], normals[index], 0.0),
         )
-        return seen_through(camera, view)
+        return _seen_through(camera, view)
 
 
 class Mujoco:
@@ -204,7 +203,7 @@ class Mujoco:
         there = number >= 0
         depth = np.where(there, depth, 0.0)
         labels = np.where(there, np.array([part.label for part in parts])[number], 0)
-        return seen_through(camera, View(depth, labels, depth_normals(depth, camera))), color
+        return _seen_through(camera, View(depth, labels, depth_normals(depth, camera))), color
 
     def _add(self, spec: Any, part: Part, k: int) -> None:
         """Add a part as one geom."""
@@ -251,15 +250,7 @@ def depth_normals(depth: Array, camera: Camera) -> Array:
     return np.asarray(np.where((lengths > 0.0) & (depth > 0.0)[..., None], normals / np.maximum(lengths, 1e-12), 0.0))
 
 
-def _together(parts: Sequence[Part]) -> tuple[Array, Indices, Indices]:
-    """Return vertices, faces and the label of each face of all parts."""
-    firsts = np.cumsum([0, *(len(part.surface.vertices) for part in parts)])
-    faces = [part.surface.faces + first for part, first in zip(parts, firsts, strict=False)]
-    labels = [np.full(len(part.surface.faces), part.label) for part in parts]
-    return np.concatenate([part.surface.vertices for part in parts]), np.concatenate(faces), np.concatenate(labels)
-
-
-def seen_through(camera: Camera, view: View) -> View:
+def _seen_through(camera: Camera, view: View) -> View:
     """Return the view of a pinhole as a camera with distortion has it."""
     if not any(camera.distortion):
         return view
@@ -387,10 +378,10 @@ class Light:
         return cls((x, y, z), rng.uniform(0.25, 0.6), (warmth[0], warmth[1], warmth[2]), rng.uniform(0.7, 1.2))
 
 
-def colors(view: View, parts: Sequence[Part], light: Light, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return the color image of a view: diffuse surfaces (Lambert), a distant light, and noise of the imager.
+def lit(view: View, parts: Sequence[Part], light: Light) -> Array:
+    """Return the colors of a view without noise: diffuse surfaces (Lambert), a distant light.
 
-    Shape (height, width, 3).
+    Shape (height, width, 3); 1 is white, and more is possible.
     """
     table = np.zeros((1 + max((part.label for part in parts), default=0), 3))
     table[0] = 0.1
@@ -398,9 +389,18 @@ def colors(view: View, parts: Sequence[Part], light: Light, rng: np.random.Gener
         table[part.label] = part.color
     direction = np.array(light.direction) / np.linalg.norm(light.direction)
     shade = light.ambient + (1.0 - light.ambient) * np.maximum(view.normals @ direction, 0.0)
-    image = table[view.labels] * shade[..., None] * light.warmth * light.gain
-    noisy = image + rng.normal(0.0, 0.01, image.shape)
-    return np.asarray((255.0 * noisy.clip(0.0, 1.0)).round().astype(np.uint8))
+    return np.asarray(table[view.labels] * shade[..., None] * light.warmth * light.gain)
+
+
+def image_of(colors: Array) -> NDArray[np.uint8]:
+    """Return an image of colors, shape (height, width, 3), of which 1 is white."""
+    return np.asarray((255.0 * colors.clip(0.0, 1.0)).round().astype(np.uint8))
+
+
+def colors(view: View, parts: Sequence[Part], light: Light, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return the color image of a view with noise of the imager, shape (height, width, 3); see :func:`lit`."""
+    image = lit(view, parts, light)
+    return image_of(image + rng.normal(0.0, 0.01, image.shape))
 
 
 def seen_share(label: int, view: View, alone: View) -> float:

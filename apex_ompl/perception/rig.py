@@ -16,6 +16,7 @@ from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.rendering import DepthSensor, View
 from apex_ompl.types import Array
 
+RED = (0.8, 0.1, 0.08, 1.0)  # color of obstacles that are seen and not told
 SIZE, FOCAL = (640, 480), 465.0  # of the default cameras [pixels]
 PLACES = {"front": (1.6, 0.0, 1.0), "above": (1.0, 0.0, 1.7)}  # of their lenses [m]
 TARGET = (0.4, 0.0, 0.45)  # at which they look [m]

@@ -9,35 +9,27 @@ MacKay 2003, chapter 27).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import permutations
 from typing import NamedTuple, get_args
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel.perception import AXIS, FitSettings, SurfaceFit, Window, fit_surface
-from apex_ompl.perception.color_parts import APART, BEFORE, PAD, ColorPart
-from apex_ompl.perception.library import opencv
+from apex_ompl.kernel.perception import AXIS, SurfaceFit, fit_surface
+from apex_ompl.perception.obstacle_settings import ObstacleSettings
 from apex_ompl.perception.registration import CorrectedFrame
-from apex_ompl.perception.rendering import lens_of
-from apex_ompl.perception.solid_starts import Kind, Solid, crosses, resized, starts
+from apex_ompl.perception.solid_pixels import FINE_STEPS, Level, Patch
+from apex_ompl.perception.solid_starts import Kind, Solid, resized, starts
 from apex_ompl.perception.surfaces import Surface, body_surface
 from apex_ompl.scene.bodies import Body
-from apex_ompl.types import Array, Indices
+from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
-Mask = NDArray[np.bool_]
-
-COARSE, FINE = 45, 90  # width or height of windows [pixels]
-COARSE_POINTS = 120
-COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at most
-COARSE_STEPS, FINE_STEPS, PROFILE_STEPS = 5, 5, 3
+COARSE_STEPS, PROFILE_STEPS = 5, 3
 RIVALS, RIVAL = 3, 1.3  # fits that are refined at most, and their largest cost over the least
-NORMALS = 150  # that are compared at most
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
 STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
@@ -48,27 +40,11 @@ KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
 MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
-HIDDEN = 0.03  # share of the border beside an occluder from which on an end may be hidden
 LONGER = 1.3  # ratio of lengths that tells whether one is
 NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
 NOT_SQUARE = 0.06  # logarithm of the ratio of sides from which on a box is no cube, beside the errors
 SLICES = 32
 ORDERS = tuple(permutations(range(3)))  # of known lengths along the axes of a box
-
-
-@dataclass(frozen=True)
-class Weights:
-    """How much measurements say; as in :class:`apex_ompl.perception.obstacles.ObstacleSettings`."""
-
-    floor: float
-    edge: float
-    point_share: float
-    contour_share: float
-    inflation: float
-    most_points: int
-    smallest: float
-    largest: float
-    cubes: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,51 +84,6 @@ class Estimate(NamedTuple):
     covariance: Array
 
 
-class Level(NamedTuple):
-    """The pixels of an obstacle at a resolution.
-
-    Attributes:
-        window: The window.
-        points: Measured points in the optical frame, then points at the border, or whose depths are their neighbors',
-            shape (N, 3) [m].
-        measured: Number of measured points.
-        beyond: Distances of pixels from those that it may cover, shape (h, w) [pixels of the window].
-        lens: Lens of the window.
-        settings: Weights of a fit.
-    """
-
-    window: Window
-    points: Array
-    measured: int
-    beyond: Array
-    lens: Array
-    settings: FitSettings
-
-
-class Patch(NamedTuple):
-    """The pixels of an obstacle.
-
-    Attributes:
-        coarse: For the search.
-        fine: For the answer.
-        extent: Points, those at the border with guessed depths, shape (M, 3) [m].
-        places: Smoothed points of its surface, shape (K, 3) [m].
-        normals: Normals there, shape (K, 3).
-        cut: Whether the image cuts it.
-        hidden: Whether an occluder is beside it.
-        pixels: Number of pixels with depth.
-    """
-
-    coarse: Level
-    fine: Level
-    extent: Array
-    places: Array
-    normals: Array
-    cut: bool
-    hidden: bool
-    pixels: int
-
-
 class _Found(NamedTuple):
     """A fit from a start."""
 
@@ -175,111 +106,15 @@ class _Found(NamedTuple):
         return -(self.fit.cost + float(spread)) / 2.0
 
 
-def patch_of(part: ColorPart, seen: CorrectedFrame, weights: Weights, least: int) -> Patch | None:
-    """Return the pixels of a part; None where fewer than ``least`` have a depth."""
-    cv, camera = opencv(), seen.camera
-    rows, columns = np.flatnonzero(part.own.any(axis=1)), np.flatnonzero(part.own.any(axis=0))
-    if not len(rows):
-        return None
-    bottom, right = rows[-1] + part.top, columns[-1] + part.left
-    top, left = rows[0] + part.top, columns[0] + part.left
-    cut = top < 2 or left < 2 or bottom > camera.height - 3 or right > camera.width - 3
-    crop = slice(max(0, rows[0] - PAD), rows[-1] + PAD + 1), slice(max(0, columns[0] - PAD), columns[-1] + PAD + 1)
-    own, guess = part.own[crop], part.filled[crop]
-    corner = part.top + crop[0].start, part.left + crop[1].start
-    depth = seen.depth[corner[0] : corner[0] + own.shape[0], corner[1] : corner[1] + own.shape[1]]
-    measured = own & (depth > 0.0) & (np.abs(depth - guess) < APART)
-    pixels = int(np.count_nonzero(measured))
-    if pixels < least:
-        return None
-    inner = cv.erode(own.astype(np.uint8), np.ones((5, 5), np.uint8), borderValue=1) > 0
-    sure = measured & inner  # depths at the border are often wrong
-    if np.count_nonzero(sure) < least:
-        sure = measured
-    occluder = (depth > 0.0) & (depth < guess - BEFORE) & ~own
-    covered = own | occluder | part.maybe[crop]
-    border = (cv.dilate(own.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~own
-    hidden = np.count_nonzero(border & occluder) > HIDDEN * np.count_nonzero(border)
-    lens = lens_of(camera)
-
-    def level(size: int, most: int, most_guessed: int) -> tuple[Level, Array]:
-        stride = -(-max(own.shape) // size)
-        height, width = own.shape[0] // stride, own.shape[1] // stride
-        window = Window(int(corner[1]), int(corner[0]), width, height, stride)
-        cells = slice(0, height * stride, stride), slice(0, width * stride, stride)
-        own_lens = window.lens(lens)
-        beyond = cv.distanceTransform((~covered[cells]).astype(np.uint8), cv.DIST_L2, 5).astype(float)
-        good, all_good = sure[cells], own[cells]
-        points, guessed = _points(guess[cells], good, own_lens), _points(guess[cells], all_good & ~good, own_lens)
-        kept = points[_spaced(len(points), most)]
-        settings = _fit_settings(weights, stride, len(points) / max(len(kept), 1), seen)
-        every = np.concatenate([kept, guessed[_spaced(len(guessed), most_guessed)]])
-        return Level(window, every, len(kept), beyond, own_lens, settings), np.concatenate([points, guessed])
-
-    fine, _ = level(FINE, weights.most_points, FINE_GUESSED)
-    coarse, extent = level(COARSE, COARSE_POINTS, COARSE_GUESSED)
-    stride = coarse.window.stride
-    grid = _grid(guess[::stride, ::stride], Window(corner[1], corner[0], 0, 0, stride).lens(lens))
-    places, normals = _normals(grid, measured[::stride, ::stride])
-    return Patch(coarse, fine, extent, places, normals, bool(cut), bool(hidden), pixels)
-
-
-def _fit_settings(weights: Weights, stride: int, thinning: float, seen: CorrectedFrame) -> FitSettings:
-    shared = max(1.0, (seen.camera.depth.correlation / stride) ** 2)
-    return FitSettings(
-        noise=seen.noise, floor=weights.floor, edge=weights.edge,
-        point_share=weights.point_share * thinning / shared / weights.inflation,
-        contour_share=weights.contour_share * stride / weights.inflation, first=0.04, last=0.02, reach=0.02,
-        steps=FINE_STEPS,
-    )  # fmt: skip
-
-
-def _spaced(count: int, most: int) -> Indices:
-    """Return up to ``most`` numbers below ``count``, equally spaced."""
-    return np.linspace(0, count - 1, min(count, most)).astype(np.int64)
-
-
-def _points(depth: Array, chosen: Mask, lens: Array) -> Array:
-    """Return the points of chosen pixels of a depth image in the optical frame, shape (N, 3) [m]."""
-    rows, columns = np.nonzero(chosen)
-    z = depth[rows, columns]
-    return np.stack([(columns - lens[2]) / lens[0] * z, (rows - lens[3]) / lens[1] * z, z], axis=-1)
-
-
-def _grid(depth: Array, lens: Array) -> Array:
-    """Return the points of a depth image in the optical frame, shape (h, w, 3) [m]."""
-    rows, columns = np.ogrid[0 : depth.shape[0], 0 : depth.shape[1]]
-    return np.stack([(columns - lens[2]) / lens[0] * depth, (rows - lens[3]) / lens[1] * depth, depth], axis=-1)
-
-
-def _normals(grid: Array, measured: Mask) -> tuple[Array, Array]:
-    """Return smoothed points and normals there by differences over a distance of pixels, both of shape (K, 3)."""
-    cv, r = opencv(), max(2, round(np.sqrt(np.count_nonzero(measured)) / 6.0))
-    weight = measured.astype(float)
-    share = cv.blur(weight, (r, r), borderType=cv.BORDER_CONSTANT)
-    smooth = cv.blur(grid * weight[..., None], (r, r), borderType=cv.BORDER_CONSTANT)
-    smooth /= np.maximum(share, 1e-9)[..., None]
-    good = share > 0.6
-    if min(good.shape) <= 2 * r:
-        return np.empty((0, 3)), np.empty((0, 3))
-    inner = good[2 * r :, r:-r] & good[: -2 * r, r:-r] & good[r:-r, 2 * r :] & good[r:-r, : -2 * r]
-    rows, columns = np.nonzero(inner)
-    step = max(1, len(rows) // NORMALS)
-    rows, columns = rows[::step] + r, columns[::step] + r
-    down = smooth[rows + r, columns] - smooth[rows - r, columns]
-    across = smooth[rows, columns + r] - smooth[rows, columns - r]
-    normals = crosses(down, across)
-    normals /= np.maximum(np.sqrt((normals * normals).sum(axis=1, keepdims=True)), 1e-12)
-    return smooth[rows, columns], np.asarray(normals)
-
-
-def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence[KnownSize] = ()) -> Estimate | None:
+def fitted(
+    patch: Patch, seen: CorrectedFrame, settings: ObstacleSettings, known: Sequence[KnownSize] = ()
+) -> Estimate | None:
     """Return the solid of a patch; None where no fit found any.
 
     Args:
         patch: Its pixels.
         seen: The frame.
-        weights: How much measurements say.
+        settings: How much measurements say.
         known: Sizes that it may have, or others.
     """
     best = _searched(patch)
@@ -289,16 +124,16 @@ def fitted(patch: Patch, seen: CorrectedFrame, weights: Weights, known: Sequence
     sized = _of_known_size(best, patch, known)
     if sized is not None:
         return _estimate(sized, misfit, seen)
-    parts = _hypotheses(best, misfit, patch, seen, weights)
-    if best.start.kind == "box" and weights.cubes > 0.0 and _square(parts[0][1]):
+    parts = _hypotheses(best, misfit, patch, seen, settings)
+    if best.start.kind == "box" and settings.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
-        parts = [(one + float(np.log(1.0 - weights.cubes)), solid) for one, solid in parts]
-        parts.append((cube.evidence + float(np.log(weights.cubes)), _estimate(cube, misfit, seen)))
+        parts = [(one + float(np.log(1.0 - settings.cubes)), solid) for one, solid in parts]
+        parts.append((cube.evidence + float(np.log(settings.cubes)), _estimate(cube, misfit, seen)))
     return mixture(parts)
 
 
 def _hypotheses(
-    best: _Found, misfit: float, patch: Patch, seen: CorrectedFrame, weights: Weights
+    best: _Found, misfit: float, patch: Patch, seen: CorrectedFrame, settings: ObstacleSettings
 ) -> list[tuple[float, Estimate]]:  # fmt: skip
     """Return estimates of different lengths along the axis that is known least, with logarithms of their evidence."""
     alone = _estimate(best, misfit, seen)
@@ -306,7 +141,7 @@ def _hypotheses(
     axis, side = end if end is not None else (_vague_axis(alone), 0.0)
     if axis is None:
         return [(best.evidence, alone)]
-    held, deviation = _profile(best, axis, side, patch, weights)
+    held, deviation = _profile(best, axis, side, patch, settings)
     if len(held) < 2 or deviation <= SHARP:
         more = misfit * deviation**2 - alone.covariance[6 + axis, 6 + axis]
         return [(best.evidence, _spread(alone, axis, max(0.0, more)))]
@@ -348,13 +183,9 @@ def _run(
     symmetry = 0 if start.kind == "box" else AXIS
     tied = np.array(ties if ties is not None else (0, 1, 2) if start.kind == "box" else (0, 0, 2))
     before = _prior(start.kind) if prior is None else prior
-    s = level.settings
-    settings = FitSettings(
-        s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach, steps
-    )  # fmt: skip
     fit = fit_surface(
         level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry,
-        start.pose, start.pose, before, settings, level.measured,
+        start.pose, start.pose, before, replace(level.settings, steps=steps), level.measured,
     )  # fmt: skip
     return _Found(start, fit, before, [*range(6), *(6 + tied)])
 
@@ -401,7 +232,9 @@ def _vague_axis(one: Estimate) -> int | None:
     return int(np.argmax(spread)) if spread.max() > VAGUE else None
 
 
-def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weights) -> tuple[list[_Found], float]:
+def _profile(
+    best: _Found, axis: int, side: float, patch: Patch, settings: ObstacleSettings
+) -> tuple[list[_Found], float]:
     """Return fits with lengths along an axis that are held, of which the end on a side moves.
 
     Lengths grow and, where the side is 0, fall from the best one by a ratio until their costs are too large. The second
@@ -413,7 +246,7 @@ def _profile(best: _Found, axis: int, side: float, patch: Patch, weights: Weight
     for ratio in (np.exp(STEP), np.exp(-STEP)) if side == 0.0 else (np.exp(STEP),):
         solid, length = best.solid, first * ratio
         for k in range(MOST_LENGTHS):
-            if not 0.5 * weights.smallest < length < weights.largest:
+            if not 0.5 * settings.smallest < length < settings.largest:
                 break
             one = _held(resized(solid, axis, length, side), axis, patch.fine)
             if k == 0:
@@ -495,12 +328,11 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
     """Return the best fit of a known size, or None where none fits as well as a size of its own."""
     found: list[tuple[float, int, _Found, Array]] = []
     for one in known:
-        solid = best.solid if one.kind == best.start.kind else None
-        if solid is None:
+        if one.kind != best.start.kind:
             continue
         orders = ORDERS if one.kind == "box" else ORDERS[:1]
         for size in dict.fromkeys(tuple(one.size[list(order)].tolist()) for order in orders):
-            start = solid
+            start = best.solid
             for axis in range(3):
                 start = resized(start, axis, float(size[axis]))
             prior = _prior(one.kind)
@@ -517,10 +349,8 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
     return min(likely, key=lambda one: one.fit.cost) if likely else None
 
 
-def mixture(parts: list[tuple[float, Estimate]]) -> Estimate | None:
-    """Return the mean and the covariance of hypotheses; turns are those of the most likely one."""
-    if not parts:
-        return None
+def mixture(parts: Sequence[tuple[float, Estimate]]) -> Estimate:
+    """Return the mean and the covariance of hypotheses, one or more; turns are those of the most likely one."""
     evidence = np.array([one for one, _ in parts])
     parts = [one for one, value in zip(parts, evidence, strict=True) if value > evidence.max() - NEGLIGIBLE]
     evidence = np.array([one for one, _ in parts])

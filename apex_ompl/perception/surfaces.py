@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import coal
@@ -41,15 +42,34 @@ class Surface(NamedTuple):
         """Return the surface at a pose, shape (4, 4) [m]."""
         return Surface(self.vertices @ pose[:3, :3].T + pose[:3, 3], self.faces)
 
+    def face_normals(self) -> Array:
+        """Return unit normals of the triangles, shape (F, 3)."""
+        areas = self._areas()
+        return np.asarray(areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-12))
+
+    def _areas(self) -> Array:
+        """Return normals of the triangles as long as twice their areas, shape (F, 3)."""
+        corners = self.vertices[self.faces]
+        return np.asarray(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+
     def normals(self) -> Array:
         """Return unit normals at the vertices, means of those of triangles weighted by area, shape (V, 3)."""
-        corners = self.vertices[self.faces]
-        areas = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = self._areas()
         sums = np.zeros_like(self.vertices)
         for k in range(3):
             np.add.at(sums, self.faces[:, k], areas)
         lengths = np.linalg.norm(sums, axis=1, keepdims=True)
         return np.asarray(sums / np.where(lengths > 0.0, lengths, 1.0))
+
+
+def joined(surfaces: Sequence[Surface]) -> Surface:
+    """Return surfaces as one, their triangles in order."""
+    firsts = np.cumsum([0, *(len(one.vertices) for one in surfaces)])
+    faces = [one.faces + first for one, first in zip(surfaces, firsts, strict=False)]
+    return Surface(
+        np.concatenate([np.empty((0, 3)), *(one.vertices for one in surfaces)]),
+        np.concatenate([np.empty((0, 3), np.int64), *faces]),
+    )
 
 
 def body_surface(body: Body, slices: int = SLICES, ball_steps: int = BALL_STEPS) -> Surface:
@@ -133,12 +153,9 @@ class RobotSurface:
         self.robot = robot
         items = list(robot.geometry.geometryObjects)
         parts = [geometry_surface(item.geometry, item.name, slices) for item in items]
-        counts = [len(part.vertices) for part in parts]
-        firsts = np.cumsum([0, *counts[:-1]])
-        self.vertices = np.concatenate([part.vertices for part in parts])
+        self.vertices, self.faces = joined(parts)
         self.normals = np.concatenate([part.normals() for part in parts])
-        self.part = np.repeat(np.arange(len(parts)), counts)
-        self.faces = np.concatenate([part.faces + first for part, first in zip(parts, firsts, strict=True)])
+        self.part = np.repeat(np.arange(len(parts)), [len(part.vertices) for part in parts])
         self.links = tuple(str(robot.model.frames[item.parentFrame].name) for item in items)
         self._data = robot.model.createData(), robot.geometry.createData()
 

@@ -212,6 +212,10 @@ def default_camera(settings: SyntheticSettings) -> Camera:
     )  # fmt: skip
 
 
+_Held = tuple[str, AttachedObject, str, AttachedObject, Array, Array]
+"""The hand, the object as it is, its kind, the object as reported, its pose in the world, its size."""
+
+
 class SceneGenerator:
     """Draws scenes of a robot with two hands."""
 
@@ -239,15 +243,7 @@ class SceneGenerator:
     def draw(self, rng: np.random.Generator, settings: SyntheticSettings | None = None) -> SyntheticScene:
         """Return a random scene."""
         given = settings or SyntheticSettings()
-        state = self._state(rng)
-        held = [
-            self._object(rng, given, name, side, state)
-            for name, side in zip(sorted(self.robot.hands), (-1, 1), strict=True)
-        ]
-        true_state = state.copy()
-        for name, _, kind, *_ in held:
-            k = self._synergy(name)
-            true_state[k] = np.clip(KINDS[kind].synergy + rng.normal(0.0, given.synergy_spread), 0.0, 1.0)
+        state, true_state, held = self._hands(rng, given)
         middle = np.mean([pose[:3, 3] for *_, pose, _ in held], axis=0)
         pose = self._camera_pose(rng, given, middle)
         reported_pose = pose @ random_error(rng, given.camera_shift, given.camera_turn)
@@ -300,13 +296,26 @@ class SceneGenerator:
             if min(a[2], b[2]) > LEAST_HEIGHT and np.linalg.norm(a - b) > LEAST_DISTANCE:
                 return q
 
+    def _hands(self, rng: np.random.Generator, settings: SyntheticSettings) -> tuple[Array, Array, list[_Held]]:
+        """Return a state as it is reported and as it is, shape (dof,) each, and the objects in the hands."""
+        state = self._state(rng)
+        held = [
+            self._object(rng, settings, name, side, state)
+            for name, side in zip(sorted(self.robot.hands), (-1, 1), strict=True)
+        ]
+        true_state = state.copy()
+        for name, _, kind, *_ in held:
+            k = self._synergy(name)
+            true_state[k] = np.clip(KINDS[kind].synergy + rng.normal(0.0, settings.synergy_spread), 0.0, 1.0)
+        return state, true_state, held
+
     def _synergy(self, hand: str) -> int:
         return self.robot.joint_names.index(str(self.robot.hands[hand].synergy))
 
     def _object(
         self, rng: np.random.Generator, settings: SyntheticSettings, hand: str, side: int, state: Array
-    ) -> tuple[str, AttachedObject, str, AttachedObject, Array, Array]:
-        """Return the hand, the object as it is, its kind, the object as reported, its pose in the world, its size."""
+    ) -> _Held:
+        """Return a random object in a hand, in a state in which the hand is closed."""
         kind = list(KINDS)[rng.integers(len(KINDS))]
         size = np.array(KINDS[kind].size) * rng.uniform(0.85, 1.15)
         if kind in ("box", "can", "peg", "cup"):
@@ -361,7 +370,7 @@ class SceneGenerator:
         return parts
 
     def _truth(
-        self, held: tuple[str, AttachedObject, str, AttachedObject, Array, Array], label: int, view: View,
+        self, held: _Held, label: int, view: View,
         camera: Camera, pose: Array, *, there: bool,
     ) -> TrueObject:  # fmt: skip
         _, body, kind, reported, at, size = held

@@ -21,13 +21,13 @@ from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.perception.camera import LARGEST_IMAGE, Camera
 from apex_ompl.perception.frames import Frame, check_camera
+from apex_ompl.perception.rig import RED
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array, Indices
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_number, check_positive
 
 BACKGROUND = 0.999  # share of the distance of the far plane from which on nothing is seen
-RED = (0.8, 0.1, 0.08, 1.0)  # of obstacles that are not simulated
 HINT = "install libegl1 or libosmesa6, and set MUJOCO_GL to egl or osmesa"
 
 

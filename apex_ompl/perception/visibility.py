@@ -19,7 +19,7 @@ from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
 from apex_ompl.perception.rendering import lens_of
-from apex_ompl.perception.surfaces import RobotSurface, Surface, body_surface, geometry_surface, inverse
+from apex_ompl.perception.surfaces import RobotSurface, Surface, body_surface, geometry_surface, inverse, joined
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body
 from apex_ompl.types import Array, Flags, Indices
@@ -89,12 +89,9 @@ class ViewPredictor:
         held = [body_surface(one).at(one.pose) for one in self.attached]
         bodies = map(obstacle_surface, (*robot.fixtures, *obstacles))
         still = [one for one in bodies if one is not None]
-        self._held, self._still = [one.vertices for one in held], [one.vertices for one in still]
-        counts = [len(self._robot.vertices), *map(len, self._held), *map(len, self._still)]
-        faces = [self._robot.faces, *(one.faces for one in (*held, *still))]
-        self._faces = np.concatenate(
-            [part + first for part, first in zip(faces, np.cumsum([0, *counts[:-1]]), strict=True)]
-        )
+        self._held, self._still = held, still
+        own = Surface(self._robot.vertices, self._robot.faces)
+        self._faces = joined([own, *held, *still]).faces
         rng = np.random.default_rng(seed)
         self._points = [surface_points(one, its, rng) for one, its in zip(self.attached, held, strict=True)]
 
@@ -109,10 +106,12 @@ class ViewPredictor:
         pose = camera.pose_at(self.robot, state)
         own = self._robot.seen_from(pose, self._robot.poses(state))
         links = [self.robot.link_pose(state, one.link) for one in self.attached]
-        parts = [_moved(points, inverse(pose) @ link) for points, link in zip(self._held, links, strict=True)]
-        parts += [_moved(points, inverse(pose)) for points in self._still]
+        parts = [one.at(inverse(pose) @ link) for one, link in zip(self._held, links, strict=True)]
+        parts += [one.at(inverse(pose)) for one in self._still]
         size = camera.height // coarse, camera.width // coarse
-        return draw_triangles(np.concatenate([own, *parts]), self._faces, lens_of(camera) / coarse, *size)[0]
+        return draw_triangles(
+            np.concatenate([own, *(one.vertices for one in parts)]), self._faces, lens_of(camera) / coarse, *size
+        )[0]
 
     def visible(self, camera: Camera, state: Array, least_cosine: float) -> tuple[Visible, ...]:
         """Return the visible shares of the objects.
@@ -129,7 +128,7 @@ class ViewPredictor:
         found = []
         for one, own in zip(self.attached, self._points, strict=True):
             pose = world @ self.robot.link_pose(state, one.link)
-            points, normals = _moved(own.points, pose), own.normals @ pose[:3, :3].T
+            points, normals = own.points @ pose[:3, :3].T + pose[:3, 3], own.normals @ pose[:3, :3].T
             seen = visible_points(points, normals, camera, depth, least_cosine)
             face = float(seen[own.face].mean()) if own.face.any() else 0.0
             found.append(Visible(float(seen[:POINTS].mean()), face))
@@ -170,8 +169,8 @@ def surface_points(body: AttachedObject, surface: Surface, rng: np.random.Genera
         rng: Source of places.
     """
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
-    corners, normals = surface.vertices[surface.faces], np.asarray(mesh.face_normals)
-    parts = [_sampled(corners, normals, np.asarray(mesh.area_faces), POINTS, rng)]
+    corners, normals, areas = surface.vertices[surface.faces], surface.face_normals(), np.asarray(mesh.area_faces)
+    parts = [_sampled(corners, normals, areas, POINTS, rng)]
     if body.contact is not None:
         axis = body.pose[:3, :3] @ np.asarray(body.contact.axis, float)
         point = body.pose[:3, :3] @ np.asarray(body.contact.point, float) + body.pose[:3, 3]
@@ -181,9 +180,7 @@ def surface_points(body: AttachedObject, surface: Surface, rng: np.random.Genera
         nearest = height.min(where=turned, initial=np.inf)
         chosen = turned & (height < nearest + 0.1 * surface.radius)
         if chosen.any():
-            parts.append(
-                _sampled(corners[chosen], normals[chosen], np.asarray(mesh.area_faces)[chosen], FACE_POINTS, rng)
-            )
+            parts.append(_sampled(corners[chosen], normals[chosen], areas[chosen], FACE_POINTS, rng))
     points, turned_to = (np.concatenate([part[k] for part in parts]) for k in range(2))
     return SurfacePoints(points, turned_to, np.arange(len(points)) >= POINTS)
 
@@ -191,7 +188,10 @@ def surface_points(body: AttachedObject, surface: Surface, rng: np.random.Genera
 def _sampled(
     corners: Array, normals: Array, areas: Array, count: int, rng: np.random.Generator
 ) -> tuple[Array, Array]:  # fmt: skip
-    """Return points of triangles, shape (T, 3, 3), spread evenly over their areas, and normals, shape (N, 3) each."""
+    """Return points of triangles, shape (T, 3, 3), spread evenly over their areas, and normals, shape (N, 3) each.
+
+    Shares of so few points vary less than those of independent ones, which trimesh draws.
+    """
     places = (np.arange(count) + rng.random()) / count * areas.sum()
     chosen = np.minimum(np.searchsorted(np.cumsum(areas), places), len(areas) - 1)
     a, b = rng.random((2, count))
@@ -220,7 +220,3 @@ def visible_points(points: Array, normals: Array, camera: Camera, depth: Array, 
     cell = np.where(inside[:, None], pixels / COARSE, 0.0).round().astype(np.int64)
     column, row = np.minimum(cell[:, 0], depth.shape[1] - 1), np.minimum(cell[:, 1], depth.shape[0] - 1)
     return np.asarray(inside & turned & (depth[row, column] > z - BEFORE))
-
-
-def _moved(points: Array, pose: Array) -> Array:
-    return points @ pose[:3, :3].T + pose[:3, 3]

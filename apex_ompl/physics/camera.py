@@ -17,14 +17,15 @@ import pinocchio as pin
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.drivers.grasps import in_link
 from apex_ompl.drivers.mujoco import MujocoDriver
+from apex_ompl.drivers.twin import COLORS
 from apex_ompl.drivers.vessels import liquid
 from apex_ompl.errors import ParameterError
 from apex_ompl.perception.alignment import AlignSettings, SeenTask, vect_align
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
 from apex_ompl.perception.held import HeldSettings
-from apex_ompl.perception.obstacles import ObstacleSettings
-from apex_ompl.perception.rig import check_cameras, default_cameras, misplaced, noisy, repeated
+from apex_ompl.perception.obstacle_settings import ObstacleSettings
+from apex_ompl.perception.rig import RED, check_cameras, default_cameras, misplaced, noisy, repeated
 from apex_ompl.perception.twin_camera import TwinCamera
 from apex_ompl.physics.execution import Executor
 from apex_ompl.physics.judges import Check
@@ -34,11 +35,8 @@ from apex_ompl.physics.trials import Spread, Trial, draw
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.problem import Goal, Problem
-from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer, check_number
 
-FURNITURE = (0.79, 0.65, 0.49, 1.0)  # color of what is known
-RED = (0.8, 0.1, 0.08, 1.0)  # of obstacles that are seen
 DEVIATIONS = 2.0  # of faces that have to be within the tolerance
 YIELD = 0.015  # by which fingers that yield may be off [m]
 LOOKS = 3  # from other states, at most
@@ -165,7 +163,7 @@ class CameraRunner:
             self.robot, trial, friction=self.runner.held_by_friction(), settings=self.runner.settings, seed=seed,
             film=film,
         )  # fmt: skip
-        color(executor.driver, {one.name: FURNITURE for one in trial.known.scene})
+        color(executor.driver, {one.name: COLORS["fixture"] for one in trial.known.scene})
         color(executor.driver, {one.name: RED for one in scene.hidden})
         executor.grasp()
         if told:
@@ -347,21 +345,13 @@ def errors_of(driver: MujocoDriver, task: SeenTask, hidden: Sequence[Obstacle]) 
     """Return the errors of what was seen: of faces [m] and axes [rad] by object, and of the obstacles' places [m]."""
     found: dict[str, float] = {"obstacles_seen": float(len(task.seen))}
     for one in task.held:
-        held = one.body
-        true = _held_as(one.pose, driver.pose(one.name), held)
-        found[f"face_error_{one.name}"], found[f"axis_error_{one.name}"] = true
+        true = replace(one, pose=driver.pose(one.name), scale=np.ones(3))
+        found[f"face_error_{one.name}"] = float(np.linalg.norm(one.face - true.face))
+        found[f"axis_error_{one.name}"] = float(np.arccos(np.clip(one.axis @ true.axis, -1.0, 1.0)))
     for obstacle in hidden:
         apart = [float(np.linalg.norm(one.pose[:3, 3] - obstacle.position)) for one in task.seen]
         found[f"place_error_{obstacle.name}"] = min(apart, default=float("inf"))
     return found
-
-
-def _held_as(seen: Array, true: Array, held: AttachedObject) -> tuple[float, float]:
-    point = np.array(held.contact.point if held.contact else (0.0, 0.0, 0.0))
-    axis = np.array(held.contact.axis if held.contact else (0.0, 0.0, 1.0))
-    off = (seen[:3, :3] @ point + seen[:3, 3]) - (true[:3, :3] @ point + true[:3, 3])
-    turn = (seen[:3, :3] @ axis) @ (true[:3, :3] @ axis) / (axis @ axis)
-    return float(np.linalg.norm(off)), float(np.arccos(np.clip(turn, -1.0, 1.0)))
 
 
 def _with_contacts(run: TaskRun, driver: MujocoDriver, hidden: set[str]) -> TaskRun:

@@ -23,7 +23,7 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from apex_ompl.perception.detection_fit import DetectionFit, fused, nearest
+from apex_ompl.perception.detection_fit import DetectionFit, nearest, with_detection
 from apex_ompl.perception.detector import OPEN, DetectedObject, ObjectDetector
 from apex_ompl.perception.detector_scenes import ObjectScene, ObjectSceneGenerator, SceneObject, matched
 from apex_ompl.perception.held import Expected, HeldObject, HeldObjectFinder, HeldSettings
@@ -189,12 +189,12 @@ class Methods:
         options: dict[str, list[Expected | None]] = {
             f"grasp x{factor} + fit": list(expected),
             f"grasp x{factor} and detector + fit": [
-                one if it is None else fused(one, it) for one, it in zip(expected, near, strict=True)
+                one if it is None else with_detection(one, it) for one, it in zip(expected, near, strict=True)
             ],
         }
         if factor == WRONG[-1]:
             options["detector + fit, held"] = [
-                None if it is None else fused(one, it) for one, it in zip(unsure, near, strict=True)
+                None if it is None else with_detection(one, it) for one, it in zip(unsure, near, strict=True)
             ]
         samples = []
         for method, starts in options.items():

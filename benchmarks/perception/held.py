@@ -26,7 +26,7 @@ import numpy as np
 import pinocchio as pin
 from tqdm import tqdm
 
-from apex_ompl.perception.detection_fit import fused, nearest
+from apex_ompl.perception.detection_fit import nearest, with_detection
 from apex_ompl.perception.detector import ObjectDetector
 from apex_ompl.perception.frames import Frame, mean_frame
 from apex_ompl.perception.held import HeldObject, HeldObjectFinder
@@ -117,7 +117,7 @@ def _with_detector(
     seen = corrected(frame, surface, finder.settings.registration)
     expected = finder.expected(seen.registration.state)
     near = [nearest(found, one.body.name, one) for one in expected]
-    both = [one if it is None else fused(one, it) for one, it in zip(expected, near, strict=True)]
+    both = [one if it is None else with_detection(one, it) for one, it in zip(expected, near, strict=True)]
     return finder.find_expected(seen, both), time.process_time() - started
 
 
@@ -200,16 +200,20 @@ def covariance_rows(found: Sequence[Sample]) -> list[list[Any]]:
     rows = []
     for method in METHODS:
         for kind in sorted({one.kind for one in found}):
-            squared = np.array([s.squared for s in found if s.method == method and s.kind == kind and not s.reason])
-            count = len(squared) / RENDERERS
-            low, high = band(count)
-            share, slack = float(np.mean(squared < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / count)
-            rows.append(
-                [method, kind, len(squared), f"{squared.mean() / DIMENSIONS:.2f}", f"{low:.2f} to {high:.2f}",
-                 f"{np.median(squared) / MEDIAN:.2f}", f"{share:.3f}",
-                 f"{0.95 - slack:.3f} to {min(1.0, 0.95 + slack):.3f}"]
-            )  # fmt: skip
+            squared = [s.squared for s in found if s.method == method and s.kind == kind and not s.reason]
+            rows.append([method, kind, *squared_cells(squared, RENDERERS)])
     return rows
+
+
+def squared_cells(squared: Sequence[float], renderers: int) -> list[Any]:
+    """Return the cells of normalized squared errors of objects that a number of renderers drew alike."""
+    values, count = np.array(squared), len(squared) / renderers
+    low, high = band(count)
+    share, slack = float(np.mean(values < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / count)
+    return [
+        len(values), f"{values.mean() / DIMENSIONS:.2f}", f"{low:.2f} to {high:.2f}",
+        f"{np.median(values) / MEDIAN:.2f}", f"{share:.3f}", f"{0.95 - slack:.3f} to {min(1.0, 0.95 + slack):.3f}",
+    ]  # fmt: skip
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

@@ -60,7 +60,7 @@ from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
-from benchmarks.perception.held import CHI_SQUARED, DIMENSIONS, MEDIAN, band, compact, squared_error, table
+from benchmarks.perception.held import compact, squared_cells, squared_error, table
 
 DEPENDS = (
     "apex_ompl/perception/looking.py", "apex_ompl/perception/visibility.py", "apex_ompl/perception/fusion.py",
@@ -358,17 +358,9 @@ def squared_rows(found: Sequence[Sample], renderers: int) -> list[list[Any]]:
     rows = []
     for label, chosen in (("all", list(found)), ("fused", [one for one in found if one.fused])):
         for kind in (*sorted({one.kind for one in chosen}), "every kind"):
-            squared = np.array([s.squared for s in chosen if s.answered and kind in (s.kind, "every kind")])
-            if not len(squared):
-                continue
-            count = len(squared) / renderers
-            low, high = band(count)
-            share, slack = float(np.mean(squared < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / count)
-            rows.append(
-                [label, kind, len(squared), f"{squared.mean() / DIMENSIONS:.2f}", f"{low:.2f} to {high:.2f}",
-                 f"{np.median(squared) / MEDIAN:.2f}", f"{share:.3f}",
-                 f"{0.95 - slack:.3f} to {min(1.0, 0.95 + slack):.3f}"]
-            )  # fmt: skip
+            squared = [s.squared for s in chosen if s.answered and kind in (s.kind, "every kind")]
+            if squared:
+                rows.append([label, kind, *squared_cells(squared, renderers)])
     return rows
 
 

@@ -38,7 +38,8 @@ from benchmarks.lib import record
 
 DEPENDS = (
     "apex_ompl/perception/obstacles.py", "apex_ompl/perception/color_parts.py", "apex_ompl/perception/solid_fit.py",
-    "apex_ompl/perception/solid_starts.py",
+    "apex_ompl/perception/solid_starts.py", "apex_ompl/perception/solid_pixels.py",
+    "apex_ompl/perception/obstacle_settings.py",
     "apex_ompl/perception/registration.py", "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py",
     "apex_ompl/perception/synthetic.py", "apex_ompl/perception/camera.py",
     "apex_ompl/kernel/compiled/perception", "apex_ompl/kernel/perception.py",

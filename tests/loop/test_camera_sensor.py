@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.loop import Cameras, CameraSensor, Observation
 from apex_ompl.loop.cycle import unexpected
 from apex_ompl.loop.tracking import Tracker
-from apex_ompl.perception.rig import default_cameras
+from apex_ompl.perception import Frame
+from apex_ompl.perception.rig import Eye, default_cameras
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.problems.worlds import ScriptedEnvironment, environment_of
 
@@ -51,6 +53,46 @@ def test_a_moving_cube_is_observed_where_it_is() -> None:
         assert cube.name == "seen_1" and one.errors == {"seen_1": sensor.error}
         size = cube.box or (2.0 * cube.cylinder.radius, cube.cylinder.length)  # type: ignore[union-attr]
         assert 0.11 < min(size) and max(size) < 0.24
+
+
+def test_observations_have_the_stamps_of_frames_and_frames_need_colors() -> None:
+    environment = world(CUBE)
+    sensor, driver = sensor_of(environment)
+
+    class Late:
+        """A camera whose frames are a while old."""
+
+        def __init__(self, eye: Eye, colors: bool) -> None:
+            self.camera, self.eye, self.colors = eye.camera, eye, colors
+
+        def frame(self) -> Frame:
+            frame = self.eye.frame()
+            return replace(frame, stamp=frame.stamp - 0.04, color=frame.color if self.colors else None)
+
+    late = CameraSensor([Late(eye, True) for eye in sensor.eyes], robot(), environment.problem.attached, latency=0.02)
+    driver.advance(0.5)
+    found = late.read(0.5)
+    assert found is not None and found.stamp == pytest.approx(0.46) and found.received == pytest.approx(0.48)
+    blind = CameraSensor([Late(sensor.eyes[0], False)], robot())
+    with pytest.raises(ParameterError, match="'front' without colors"):
+        blind.read(0.5)
+
+
+def test_a_run_closes_the_sensor_that_it_made() -> None:
+    closed = []
+
+    class Closing:
+        named = False
+
+        def read(self, now: float) -> Observation:
+            return Observation(now, now, ())
+
+        def close(self) -> None:
+            closed.append(True)
+
+    settings = LoopSettings(error=0.02, fastest=0.2, timeout=0.5)
+    run(world(CUBE), "no-network", driver="kinematic", sensor=lambda *_: Closing(), settings=settings)
+    assert closed == [True]
 
 
 def test_an_obstacle_that_left_the_space_is_gone() -> None:

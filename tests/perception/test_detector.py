@@ -16,7 +16,7 @@ from safetensors.numpy import save as save_arrays
 
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
 from apex_ompl.perception.camera import Camera, look_at
-from apex_ompl.perception.detection_fit import DetectionFit, fused, nearest
+from apex_ompl.perception.detection_fit import DetectionFit, nearest, with_detection
 from apex_ompl.perception.detector import (
     FOCAL,
     KINDS,
@@ -239,7 +239,7 @@ def test_a_detection_and_a_grasp_are_fused_by_their_covariances(scenes: list[Obj
     finder = HeldObjectFinder(robot, scene.reported)
     for one, true in zip(finder.expected(scene.frame.state(robot.joint_names)), scene.objects, strict=False):
         guess = detection(true, rng, 0.005, 5.0)
-        found = fused(one, guess)
+        found = with_detection(one, guess)
         a, b = one.covariance[3:, 3:], guess.covariance[3:, 3:]
         weighted = np.linalg.solve(a, one.pose[:3, 3]) + np.linalg.solve(b, guess.center)
         both = np.linalg.solve(np.linalg.inv(a) + np.linalg.inv(b), weighted)
@@ -249,7 +249,7 @@ def test_a_detection_and_a_grasp_are_fused_by_their_covariances(scenes: list[Obj
             np.testing.assert_allclose(found.pose[:3, :3], one.pose[:3, :3])
         elif true.kind not in OPEN:
             turned = DetectedObject(**{**guess.__dict__, "axis": -guess.axis})
-            np.testing.assert_allclose(fused(one, turned).pose, found.pose, atol=1e-9)
+            np.testing.assert_allclose(with_detection(one, turned).pose, found.pose, atol=1e-9)
         assert nearest([guess], true.kind, one, 0.2) is guess
         assert nearest([guess], true.kind, one, 1e-6) is None and nearest([guess], "none", one) is None
 

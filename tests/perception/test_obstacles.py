@@ -20,7 +20,8 @@ from apex_ompl.perception.synthetic import solid_part
 pytest.importorskip("cv2")
 
 from apex_ompl.perception.color_parts import Color, color_parts  # noqa: E402
-from apex_ompl.perception.obstacles import ObstacleFinder, ObstacleSettings, SeenObstacle  # noqa: E402
+from apex_ompl.perception.obstacle_settings import ObstacleSettings  # noqa: E402
+from apex_ompl.perception.obstacles import ObstacleFinder, SeenObstacle  # noqa: E402
 from apex_ompl.perception.solid_fit import Estimate, KnownSize, mixture  # noqa: E402
 from apex_ompl.perception.solid_starts import Solid  # noqa: E402
 
