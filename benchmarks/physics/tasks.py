@@ -60,7 +60,7 @@ def row_of(run: TaskRun, seconds: float) -> dict[str, Any]:
     return {
         "seed": run.seed, "outcome": run.outcome, "reason": run.reason, "failed": failed, "causes": causes(run),
         "grasps": [[one.object, one.hand, one.kind] for one in run.grasps], "metrics": dict(run.metrics),
-        "obstacles": obstacles, "cpu": round(seconds, 3),
+        "obstacles": obstacles, "cpu": round(seconds, 3), "commit": record.session()["commit"],
     }  # fmt: skip
 
 
@@ -149,6 +149,7 @@ def main() -> None:
     done = sum(row["outcome"] == "DONE" for row in total)
     lines.append(record.row(["all of them", len(total), done, *[""] * (len(HEAD) - 3)]))
     settings = {"n": given.n, "seed": given.seed, "timeout": TIMEOUT, "mujoco": mujoco().__version__}
+    settings["run_commits"] = "; ".join(sorted({row["commit"] for row in total}))
     record.write("physics_tasks", {"runs": found, "spread": vars(Spread())}, "\n".join(lines), **settings)
 
 
