@@ -80,7 +80,7 @@ class SeenTask:
         alignment: The alignment, of the objects of ``attached``, where there is one.
         attached: The held objects as they were seen.
         vectors: Contact faces of both objects as vectors in the world; empty without a task.
-        obstacles: Obstacles, larger by the margin; of boxes seen from one side it may be too small.
+        obstacles: Obstacles, larger by the margin.
         held: All held objects with their covariances.
         seen: All obstacles with their covariances.
         camera: Corrected pose of the optical frame in the world, shape (4, 4) [m].
