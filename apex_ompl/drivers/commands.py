@@ -92,7 +92,7 @@ class Commands:
         del self._starts[k + 1 :], self._motions[k + 1 :]
         if not 0.0 <= since < motion.duration:
             return motion.after(max(since, 0.0))
-        rest = motion.stop_at(since, self.limits).after(since)
+        rest = motion.after(since).stop_at(0.0, self.limits)
         self._starts.append(at)
         self._motions.append(rest)
         return rest

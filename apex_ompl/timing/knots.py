@@ -4,9 +4,10 @@ A motion of constant jerk between knots is a cubic spline in time. With other kn
 the accelerations of the first one at the new knots, except for a small smooth correction, by which it meets positions
 and velocities exactly at the ends of windows of time. Within a window the correction is
 
-    dq''(t) = tau (1 - tau) (c_1 + c_2 (1 - 2 tau)),   tau = 0..1,
+    dq''(t) = w tau (1 - tau) (c_1 + c_2 (1 - 2 tau)),   tau = 0..1,
 
-sampled at the knots; it vanishes at the ends, and c_1, c_2 follow from the change of velocity and position.
+sampled at the knots; it vanishes at the ends, and c_1, c_2 follow from the change of velocity and position. The weight
+w is 1, or, near a joint's largest acceleration, falls to almost 0, so that the acceleration stays within its limit.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ NANOSECONDS = 1e9  # in a second
 SAME_TIME = 1e-4  # largest distance of a time from whole nanoseconds, by rounding [ns]
 SAME_COUNT = 1e-6  # part of a span that counts as none
 LEAST_SPANS = 4  # of a window
+NEAR_BOUND = 0.01  # share of the largest acceleration below it, within which the correction vanishes
+LEAST_WEIGHT = 1e-8  # of the correction at the largest acceleration, for windows without other knots
 
 
 def on_grid(times: Array) -> Array:
@@ -102,13 +105,14 @@ def windows(times: Array, window: float) -> list[int]:
     return ends
 
 
-def refitted(states: Array, times: Array, window: float) -> Array:
+def refitted(states: Array, times: Array, window: float, bounds: Array | None = None) -> Array:
     """Return the states of the motion with knots at given times that follows another motion, shape (3, K, dof).
 
     Args:
         states: Positions, velocities and accelerations of the other motion at the knots, shape (3, K, dof).
         times: Of the knots, shape (K,), at least four spans [s].
         window: Least length of the windows at whose ends both motions have the same state [s].
+        bounds: Largest accelerations, near which there is next to no correction, shape (dof,) [rad/s^2].
     """
     q, v, a = states.copy()
     ends = windows(times, window)
@@ -128,9 +132,12 @@ def refitted(states: Array, times: Array, window: float) -> Array:
     speed, place = integrals(a)
     missing = gains(np.diff(v, axis=0) - speed, np.diff(q, axis=0) - h * v[:-1] - place)
     tau = (since / length)[:, None]
-    even = tau * (1.0 - tau)
+    even, turn = tau * (1.0 - tau), 1.0 - 2.0 * tau
     even[ends] = 0.0
-    odd = even * (1.0 - 2.0 * tau)
+    if bounds is not None:
+        room = (1.0 - np.abs(a) / np.maximum(bounds, np.finfo(float).tiny)) / NEAR_BOUND
+        even = even * np.clip(room, LEAST_WEIGHT, 1.0)
+    odd = even * turn
     (a11, a21), (a12, a22) = gains(*integrals(even)), gains(*integrals(odd))
     determinant = a11 * a22 - a12 * a21
     c1 = (missing[0] * a22 - missing[1] * a12) / determinant

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -40,11 +40,13 @@ SPEED_SPACING, MAX_SPEED_SAMPLES = 0.001, 2**15  # of the speed profile for the 
 LEAST_SPACING = 1e-3
 """Least time between knots for a controller [s]."""
 LIMIT_ROOM = 9e-4  # share by which a motion with other knots may exceed a limit; 1e-3 with the rounding in files
-WINDOWS = (0.1, 0.2, 0.4)  # of a motion with other knots, at whose ends it has the same state [s]
+WINDOWS = (0.1, 0.2, 0.4, 0.8)  # of a motion with other knots, at whose ends it has the same state [s]
 NO_RATE = np.array([[1e-6], [1e-4], [1e-1]])  # velocity, acceleration and jerk that count as none [rad/s^k]
 RATES = (10, 20, 25, 40, 50, 100, 125, 200, 250, 400, 500, 1000)  # that are offered [Hz]
 SAME_STATE = 1e-6  # largest difference of states where motions are joined [rad/s^k]
 STOP_DEVIATION = 1e-3  # of a stop from the path [rad]
+MERGED_EXCESS = 1e-8  # share over a limit with merged knots, at which no longer windows are tried
+STOP_SHARE = 1.0 - 9e-7  # of the limits, for a stop along a path; motions use 1e-6 less than all
 STOP_SHARES = (1.0, 0.99, 0.97, 0.9)  # of the limits, for a stop joint by joint whose knots are merged
 
 
@@ -266,8 +268,8 @@ class Trajectory:
         """Return the motion with knots at whole nanoseconds, at least ``spacing`` apart [s]; itself where they are so.
 
         Of knots that are nearer to each other one is kept, and the accelerations are corrected for it
-        (:mod:`apex_ompl.timing.knots`). Both ends are exact. Velocities, accelerations and jerks may be larger by some
-        1e-4 of the largest. A motion shorter than eight spacings gets proportionally nearer knots.
+        (:mod:`apex_ompl.timing.knots`). Both ends are exact. Velocities, accelerations and jerks are larger by less
+        than 1e-8 of the largest in most motions, and by some 1e-4 in few. A motion shorter than eight spacings gets proportionally nearer knots.
 
         Raises:
             ParameterError: ``spacing`` is not a positive number, or the motion takes a few nanoseconds only.
@@ -279,12 +281,12 @@ class Trajectory:
         spacing = min(spacing, self.duration / (2 * LEAST_SPANS))
         if not gaps.size or (gaps.min() >= spacing * (1.0 - 1e-6) and is_on_grid(self.times)):
             return self
-        return self._at_knots(spaced(self.times, spacing), self._extremes.rates)[0]
+        return self._at_knots(spaced(self.times, spacing), self._extremes.rates, MERGED_EXCESS)[0]
 
     def resampled(self, rate: float, limits: Limits | None = None) -> Trajectory:
         """Return the motion with knots at a rate, and at its end; the jerk is constant between them.
 
-        It is another motion, which has the same state as this one every 0.1 to 0.4 s. In between it is, for motions of
+        It is another motion, which has the same state as this one every 0.1 to 0.8 s. In between it is, for motions of
         two Pandas, some 0.1 mrad from it at 100 Hz and 0.01 mrad at 250 Hz; :meth:`deviation` tells. Both ends are
         exact. Velocities, accelerations and jerks are at most 1e-3 over the limits. The end is one to two spacings from
         the knot before it.
@@ -312,18 +314,21 @@ class Trajectory:
                 raise ParameterError("rate", rate, f"at least {higher} Hz, at which this motion keeps its limits")
         raise ParameterError("rate", rate, "none: the motion keeps its limits with its own knots only")
 
-    def _at_knots(self, times: Array, bounds: Array) -> tuple[Trajectory, float]:
-        """Return the motion with other knots, and by which share it exceeds bounds of the rates, shape (3, dof)."""
+    def _at_knots(self, times: Array, bounds: Array, enough: float = LIMIT_ROOM) -> tuple[Trajectory, float]:
+        """Return the motion with other knots, and by which share it exceeds bounds of the rates, shape (3, dof).
+
+        Longer windows are tried where that share is over ``enough``.
+        """
         states = self.states(times)
         for k in (0, -1):
             states[:, k] = self.positions[k], self.velocities[k], self.accelerations[k]
         best, least = self, np.inf
-        for window in WINDOWS:
-            made = Trajectory.unchecked(times, refitted(states, times, window), self.joint_names)
+        for window, largest in product(WINDOWS, (None, bounds[1])):
+            made = Trajectory.unchecked(times, refitted(states, times, window, largest), self.joint_names)
             excess = float(((made._extremes.rates - bounds) / np.maximum(bounds, NO_RATE)).max())
             if excess < least:
                 best, least = made, excess
-            if excess <= LIMIT_ROOM or self.duration <= window:
+            if excess <= enough or (self.duration <= window and largest is not None):
                 break
         return best, least
 
@@ -372,7 +377,9 @@ class Trajectory:
         The stop slows down along the path, at most a millirad from it
         (:func:`apex_ompl.kernel.moving.stop_on_path`); where it cannot, as the motion does not end at rest, each joint
         stops by itself (:func:`apex_ompl.kernel.moving.stop_joints`). Where no stop is sooner than the end of the
-        motion, it is the motion itself. :func:`joined` adds a motion that goes on.
+        motion, it is the motion itself. :func:`joined` adds a motion that goes on. Where knots are merged, it is nearly
+        the motion before ``time``; what replaces a motion under way from a time ``t`` on, and starts in its exact
+        state, is ``motion.after(t).stop_at(0.0, limits)``.
 
         Args:
             time: Time at which the robot starts to slow down [s].
@@ -388,10 +395,11 @@ class Trajectory:
                 raise ParameterError("limits", f"{share:.4g} of the {name} limit is used", "limits the motion keeps")
         if self.velocities[-1].any() or self.accelerations[-1].any():
             return self._joint_stop(time, limits)
-        found = stop_on_path(
-            self.times, np.stack([self.positions, self.velocities, self.accelerations]), time, LimitArrays.of(limits),
-            STOP_DEVIATION,
-        )  # fmt: skip
+        states, bounds = np.stack([self.positions, self.velocities, self.accelerations]), LimitArrays.of(limits)
+        room = bounds._replace(acceleration=STOP_SHARE * bounds.acceleration, jerk=STOP_SHARE * bounds.jerk)
+        found = stop_on_path(self.times, states, time, room, STOP_DEVIATION) or stop_on_path(
+            self.times, states, time, bounds, STOP_DEVIATION
+        )
         if found is None:
             return self
         return joined([self.before(time), Trajectory.unchecked(found[0], found[1], self.joint_names)]).merged()

@@ -73,7 +73,7 @@ def follow(count: int) -> dict[str, float]:
         for state in tqdm(states[1:], unit="motion"):
             motion = time_path(np.stack([q, state]), limits, names).trajectory
             half, start = 0.5 * motion.duration, driver.time + LEAD
-            rest = motion.stop_at(half, limits).after(half)
+            rest = motion.after(half).stop_at(0.0, limits)
             for at, one in ((start, motion), (start + half, rest)):
                 time.sleep(max(0.0, at - LEAD - driver.time))
                 began = driver.time

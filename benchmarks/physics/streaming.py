@@ -93,7 +93,7 @@ class Client:
             start = self._soon(later)
             since = start - at
             if since < motion.duration - 0.05:
-                rest = motion.stop_at(since + self.rng.uniform(0.0, 0.05), self.robot.limits).after(since)
+                rest = motion.after(since).stop_at(self.rng.uniform(0.0, 0.05), self.robot.limits)
                 self.send(joined([rest, self.line(rest.positions[-1])]), start, later)
                 self.counts["handovers"] += 1
         elif kind < SHARES["handover"] + SHARES["stop"]:

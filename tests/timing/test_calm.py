@@ -170,6 +170,9 @@ def test_motions_stop_and_go_on(path: np.ndarray, share: float) -> None:
     time = share * motion.duration
     stopped = motion.stop_at(time, LIMITS)
     assert max(stopped.use(LIMITS).values()) <= 1.001 and stopped.duration <= motion.duration + 1e-9
+    rest = motion.after(time).stop_at(0.0, LIMITS)
+    for order in range(3):
+        np.testing.assert_allclose(rest(0.0, order), motion(time, order), rtol=0.0, atol=1e-9)
     before = np.linspace(0.0, time, 101)
     assert np.abs(stopped(before) - motion(before)).max() < 2e-4
     np.testing.assert_allclose(stopped.velocities[-1], 0.0, atol=1e-9)
@@ -184,6 +187,17 @@ def test_motions_stop_and_go_on(path: np.ndarray, share: float) -> None:
         whole = joined([stopped, on])
         np.testing.assert_array_equal(whole.positions[-1], motion.positions[-1])
         assert max(whole.use(LIMITS).values()) <= 1.001
+
+
+def test_accelerations_of_merged_stops_keep_the_limits() -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(60):
+        motion = timed(np.stack([np.zeros(3), rng.uniform(-2.0, 2.0, 3)])).trajectory
+        k = rng.integers(1, len(motion.times) // 2)
+        time = motion.times[k] + rng.choice([-1.0, 1.0]) * rng.uniform(1e-4, 9e-4)  # so that knots are merged
+        made = motion.stop_at(time, LIMITS)
+        assert np.diff(made.times).min() >= 1e-3 - 1e-9
+        assert made.use(LIMITS)["acceleration"] <= 1.0 + 1e-5
 
 
 def test_a_motion_that_goes_on_stops_joint_by_joint() -> None:
