@@ -56,7 +56,7 @@ class CameraSensor:
     named = False
 
     def __init__(
-        self, eyes: Sequence[Eye], robot: Robot, attached: Sequence[AttachedObject] = (), *, rate: float = 10.0,
+        self, eyes: Sequence[Eye], robot: Robot, attached: Sequence[AttachedObject] = (), *, rate: float = 30.0,
         latency: float = 0.03, error: float = 0.01, obstacles: ObstacleSettings | None = None,
         tracker: TrackerSettings | None = None, registration: RegistrationSettings | None = None,
     ) -> None:  # fmt: skip
@@ -142,7 +142,7 @@ class Cameras:
     """
 
     cameras: tuple[Camera, ...] = field(default_factory=lambda: default_cameras(WIDTH))
-    rate: float = 10.0
+    rate: float = 30.0
     latency: float = 0.03
     error: float = 0.01
     obstacles: ObstacleSettings = field(default_factory=lambda: ObstacleSettings(low=LOW, high=HIGH))

@@ -269,7 +269,8 @@ class Trajectory:
 
         Of knots that are nearer to each other one is kept, and the accelerations are corrected for it
         (:mod:`apex_ompl.timing.knots`). Both ends are exact. Velocities, accelerations and jerks are larger by less
-        than 1e-8 of the largest in most motions, and by some 1e-4 in few. A motion shorter than eight spacings gets proportionally nearer knots.
+        than 1e-8 of the largest in most motions, and by some 1e-5 in few. A motion shorter than eight spacings gets
+        proportionally nearer knots.
 
         Raises:
             ParameterError: ``spacing`` is not a positive number, or the motion takes a few nanoseconds only.

@@ -7,7 +7,7 @@ of 640 x 480 pixels (drawn by MuJoCo, nine frames a look, noise and missing dept
 off by the spreads of a calibration), with looks from other states where something is not known well enough; or they are
 told as they are. Tasks are judged by where the objects are at the end (:mod:`apex_ompl.physics.judges`), and fail where
 anything touched the cube. **Worlds**: the loop among obstacles that move, the robot in physics, judged by the referee
-with the measured motion. Either two cameras of 320 x 240 pixels see them (drawn by the kernel's renderer, 10 frames a
+with the measured motion. Either two cameras of 320 x 240 pixels see them (drawn by the kernel's renderer, 30 frames a
 second, 30 ms late, the same errors), or an ideal sensor. A task or run that was not planned or not started, for
 whatever reason, failed.
 

@@ -38,7 +38,7 @@ def sensor_of(environment: ScriptedEnvironment, **settings: Any) -> tuple[Camera
 
 def test_a_moving_cube_is_observed_where_it_is() -> None:
     environment = world(CUBE)
-    sensor, driver = sensor_of(environment)
+    sensor, driver = sensor_of(environment, rate=10.0)
     seen: list[Observation] = []
     for k in range(60):
         driver.advance(0.01 * k)
