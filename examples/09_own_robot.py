@@ -2,7 +2,7 @@
 
 import time
 
-from apex_ompl import ApexError, LoopSettings, Obstacle, load_problem, load_robot, run
+from apex_ompl import LoopSettings, Obstacle, Trajectory, load_problem, load_robot, run
 from apex_ompl.drivers import DriverState
 from apex_ompl.loop import Observation
 
@@ -19,29 +19,26 @@ class Camera:
 class Robot:
     """Follows each motion from its time on, to its end at rest."""
 
-    time, end, fault = property(lambda self: time.monotonic()), 0.0, ""  # end of the last motion; why it stopped
+    time, fault = property(lambda self: time.monotonic()), ""  # why it stopped
+    end = property(lambda self: self.sent[-1][0] + self.sent[-1][1].duration)  # of the last motion
 
-    def __init__(self, model, start):
-        """Rest at a state."""
-        self.names, self.limits, self.start, self.sent = model.joint_names, model.limits, start, []
+    def __init__(self, problem):
+        """Rest at the start."""
+        model = load_robot(problem.robot)
+        q = problem.start_state(model.joint_names)
+        self.names, self.limits, self.sent = model.joint_names, model.limits, []
+        self.send(Trajectory([0], [q], [0 * q], [0 * q], self.names), 0.0)
 
     def state(self) -> DriverState:
         """Return the measured state: here it is where it should be."""
         now = self.time
-        for at, motion in self.sent[::-1]:
-            if at <= now:
-                return DriverState(now, motion(now - at), motion(now - at, 1))
-        return DriverState(now, self.start, 0.0 * self.start)
+        at, motion = next((at, motion) for at, motion in self.sent[::-1] if at <= now)
+        return DriverState(now, motion(now - at), motion(now - at, 1))
 
     def send(self, motion, at: float) -> None:
         """Take a motion in place of what would be done from a time on."""
-        if at < self.time:
-            raise ApexError("the motion comes too late")
         self.sent.append((at, motion))
-        self.end = at + motion.duration
 
 
 problem, settings = load_problem("vertical/free/800001"), LoopSettings(error=0.01, fastest=0.3, period=0.025)
-model = load_robot(problem.robot)
-robot = Robot(model, problem.start_state(model.joint_names))
-print(run(problem, clock="real", sensor=Camera(), driver=robot, settings=settings))
+print(run(problem, clock="real", sensor=Camera(), driver=Robot(problem), settings=settings))
