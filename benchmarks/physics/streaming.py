@@ -1,7 +1,8 @@
 """A million samples at 1 kHz of motions that are handed over 20 to 50 ms ahead: no step over a limit.
 
 Random motions of two arms and hands, straight in the joint space and timed to their limits, are sent by a driver's
-rules; two in five are replaced in the middle by a stop and another motion, one in five is stopped. What each controller
+rules; two in five are replaced in the middle by a stop and another motion, at a knot of the motion under way where one
+is less than a millisecond away, and one in five is stopped. What each controller
 gets, knots at whole nanoseconds, is followed by code that knows nothing of the package: polynomials of fifth degree,
 from the stamp of a message to that of the next. Its positions each millisecond are differenced.
 
@@ -26,6 +27,7 @@ from apex_ompl.drivers.commands import Commands
 from apex_ompl.drivers.controllers import Controllers
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.timing import Trajectory, joined, time_path
+from apex_ompl.timing.trajectory import LEAST_SPACING
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import one_or_more
 from benchmarks.lib import record
@@ -40,6 +42,13 @@ SHARES = {"handover": 0.4, "stop": 0.2}  # of motions
 ROOM = 1e-3  # by which motions with other knots may exceed a limit
 CONTROLLERS = {"left_arm": slice(0, 7), "right_arm": slice(7, 14), "hands": slice(14, 16)}
 Array = NDArray[np.float64]
+
+
+def clear_of_knots(motion: Trajectory, time: float) -> float:
+    """Return a time of a motion, or the knot that is less than a millisecond from it, in whole nanoseconds [s]."""
+    knot = float(motion.times[np.abs(motion.times - time).argmin()])
+    chosen = knot if abs(knot - time) < LEAST_SPACING else time
+    return round(chosen * NANOSECONDS) / NANOSECONDS
 
 
 class Message(NamedTuple):
@@ -90,11 +99,11 @@ class Client:
         kind = self.rng.random()
         later = at + self.rng.uniform(0.05, 0.9) * motion.duration
         if kind < SHARES["handover"]:
-            start = self._soon(later)
-            since = start - at
+            since = clear_of_knots(motion, self._soon(later) - at)
             if since < motion.duration - 0.05:
-                rest = motion.after(since).stop_at(self.rng.uniform(0.0, 0.05), self.robot.limits)
-                self.send(joined([rest, self.line(rest.positions[-1])]), start, later)
+                rest = motion.after(since)
+                rest = rest.stop_at(clear_of_knots(rest, self.rng.uniform(0.0, 0.05)), self.robot.limits)
+                self.send(joined([rest, self.line(rest.positions[-1])]), at + since, later)
                 self.counts["handovers"] += 1
         elif kind < SHARES["handover"] + SHARES["stop"]:
             self.stop(self._soon(later))
