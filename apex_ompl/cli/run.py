@@ -95,8 +95,6 @@ def _execute(problem: Problem, parsed: argparse.Namespace) -> int:
         print(json.dumps(result.as_dict()))
     else:
         print(result)
-        for check in result.checks:
-            print(f"  {'yes' if check.passed else 'NO '}  {check.name}: {check.found}")
     if result.outcome == UNPLANNED:
         return 3
     return 0 if result else 1

@@ -14,11 +14,13 @@ import numpy as np
 from apex_ompl.drivers.grasps import GraspFound
 from apex_ompl.physics.judges import Check
 from apex_ompl.types import Array
-from apex_ompl.util.display import one_line
+from apex_ompl.util.display import Summary, one_line
 from apex_ompl.util.files import pack_archive, path_text, suffix_of, write_atomically
 
 SUFFIXES = (".npz", ".json")
 DONE, FAILED, UNPLANNED, DROPPED, UNSEEN = "DONE", "FAILED", "NOT_PLANNED", "NOT_HELD", "NOT_SEEN"
+
+SHOWN = {"duration": ("s", 1.0), "tracking_error": ("mrad", 1e3)}  # metrics in words, with their units and factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +67,14 @@ class TaskRun:
         held = ", ".join(f"{one.object} by {one.kind}" for one in self.grasps)
         return one_line("TaskRun", self.outcome, repr(self.problem), held, self.reason)
 
+    def __str__(self) -> str:
+        """Return the lines that ``apex-ompl run`` prints."""
+        return str(_summary(self))
+
+    def _repr_html_(self) -> str:
+        """Return these lines as a table for notebooks."""
+        return _summary(self).html
+
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, without arrays."""
         return {
@@ -90,3 +100,20 @@ class TaskRun:
             return
         rows = {name: np.round(values, 6).tolist() for name, values in arrays.items()}
         write_atomically(path, (json.dumps(self.as_dict() | rows) + "\n").encode())
+
+
+def _summary(result: TaskRun) -> Summary:
+    """Return the lines about a task."""
+    measured = [
+        f"{name.replace('_', ' ')} {factor * result.metrics[name]:.3g} {unit}"
+        for name, (unit, factor) in SHOWN.items()
+        if name in result.metrics
+    ]
+    rows = [
+        ("reason", result.reason),
+        ("held", ", ".join(f"{one.object} by {one.kind}" for one in result.grasps)),
+        ("steps", ", ".join(title for title, _, _ in result.steps)),
+        ("measured", ", ".join(measured)),
+        *(("yes" if check.passed else "NO", f"{check.name}: {check.found}") for check in result.checks),
+    ]
+    return Summary(f"{result.problem}: {result.outcome}", [row for row in rows if row[1]])

@@ -117,7 +117,7 @@ def test_the_command_writes_log_and_film(
         assert "OpenGL" in capsys.readouterr().err
         pytest.skip("no OpenGL")
     text = capsys.readouterr().out
-    assert "DONE" in text and "yes  left_hand is where the plan ends" in text
+    assert "reach_past_post: DONE\n" in text and "  yes        left_hand is where the plan ends: " in text
     with np.load(log) as data:
         rows = len(data["times"])
         assert data["measured"].shape == (rows, 16) and rows > 100
