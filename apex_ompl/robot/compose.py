@@ -313,7 +313,7 @@ def _scale_and_turn(holder: ET.Element, mesh: ET.Element, path: Path, role: str)
     elif path.suffix.lower() in (".glb", ".gltf"):
         upright = np.eye(4)
         upright[:3, :3] = UPRIGHT["Y_UP"]
-        pose, scale = _origin(holder, role) @ upright, scale[[0, 2, 1]]  # in the axes of the file
+        pose, scale = origin_of(holder, role) @ upright, scale[[0, 2, 1]]  # in the axes of the file
         for origin in holder.findall("origin"):
             holder.remove(origin)
         _set_origin(holder, pose)
@@ -358,7 +358,7 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
         raise RobotError(f"locked: no joint {name!r} in the URDF")
     kind = joint.get("type")
     if kind in ("floating", "planar") and value == 0.0:
-        _fix(joint, _origin(joint, f"joint {name!r}"))
+        _fix(joint, origin_of(joint, f"joint {name!r}"))
         return
     if kind not in (*LIMITED, "continuous"):
         expected = "0 for a floating or planar joint, else revolute, continuous or prismatic"
@@ -372,7 +372,7 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
         motion[:3, 3] = value * axis
     else:
         motion[:3, :3] = pin.exp3(value * axis)
-    _fix(joint, _origin(joint, f"joint {name!r}") @ motion)
+    _fix(joint, origin_of(joint, f"joint {name!r}") @ motion)
 
 
 def _fix(joint: ET.Element, pose: Array) -> None:
@@ -384,7 +384,7 @@ def _fix(joint: ET.Element, pose: Array) -> None:
     _set_origin(joint, pose)
 
 
-def _origin(element: ET.Element, what: str) -> Array:
+def origin_of(element: ET.Element, what: str) -> Array:
     """Return the pose given by the origin of an element, shape (4, 4) [m]."""
     origin, pose = element.find("origin"), np.eye(4)
     if origin is not None:
