@@ -167,15 +167,24 @@ def read_config(path: Path) -> RobotConfig:
     return config.model_copy(update={"fixtures": tuple(located(f, path.parent) for f in config.fixtures)})
 
 
-def read_disabled_pairs(path: Path) -> list[tuple[str, str]]:
+def read_disabled_pairs_file(path: Path) -> DisabledPairs:
     """Read a file of disabled pairs.
 
     Raises:
         MissingFileError: It cannot be read.
         FileFormatError: It does not follow the schema.
     """
-    data = read_yaml(path, "file of disabled pairs")
-    return [pair.links for pair in validate(DisabledPairs, data, str(path)).pairs]
+    return validate(DisabledPairs, read_yaml(path, "file of disabled pairs"), str(path))
+
+
+def read_disabled_pairs(path: Path) -> list[tuple[str, str]]:
+    """Read the pairs of links of a file of disabled pairs.
+
+    Raises:
+        MissingFileError: It cannot be read.
+        FileFormatError: It does not follow the schema.
+    """
+    return [pair.links for pair in read_disabled_pairs_file(path).pairs]
 
 
 @cache

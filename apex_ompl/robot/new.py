@@ -351,7 +351,7 @@ class _Writer:
         lines += [
             "# Limits of position and velocity are the URDF's unless they are given here. Accelerations and jerks are",
             f"# assumed (guessed): {guesses.RAMP:g} and {guesses.JERK:g} times the velocity.",
-            f"# Home: {data_note(self.comments['home'])}.", "joints:",
+            f"# Home: {_on_one_line(self.comments['home'])}.", "joints:",
         ]  # fmt: skip
         lines += [self._line("joints", name, record, " (guessed)") for name, record in data["joints"].items()]
         if data["locked"]:
@@ -362,9 +362,7 @@ class _Writer:
             lines += [self._line("locked", name, value) for name, value in data["locked"].items()]
         lines.append("groups:")
         lines += [self._line("groups", name, members) for name, members in data["groups"].items()]
-        lines.append(
-            "hands:  # palm, grasp point, direction of the closing side and of the fingers in the palm's frame"
-        )
+        lines.append("hands:  # palm link; in its frame grasp point, closing side and direction of the fingers")
         lines += [self._line("hands", name, record) for name, record in data["hands"].items()]
         if "disabled_pairs" in data:
             lines.append(f"disabled_pairs: {_flow(data['disabled_pairs'])}")
@@ -372,7 +370,7 @@ class _Writer:
 
     def _line(self, section: str, name: str, value: Any, mark: str = "") -> str:
         comment = self.comments.get(f"{section}.{name}", "")
-        return f"  {_flow(name)}: {_flow(value)}" + (f"  # {data_note(comment)}{mark}" if comment else "")
+        return f"  {_flow(name)}: {_flow(value)}" + (f"  # {_on_one_line(comment)}{mark}" if comment else "")
 
 
 def _near(states: np.ndarray) -> np.ndarray:
@@ -391,7 +389,7 @@ def _adjacent(parts: list[_Part], links: tuple[str, str]) -> bool:
     return False
 
 
-def data_note(text: str) -> str:
+def _on_one_line(text: str) -> str:
     """Return a comment on one line."""
     return " ".join(text.split())
 
@@ -434,11 +432,8 @@ def pairs_text(pairs: Sequence[tuple[tuple[str, str], str]], command: str, robot
         command: The command that makes it.
         robot: The digest of the robot that it is made for.
     """
-    lines = [
-        f"schema: {PAIRS_SCHEMA}",
-        f"command: {_flow(command)}",
-        *([f"robot: {json.dumps(robot)}"] if robot else []),
-    ]
+    lines = [f"schema: {PAIRS_SCHEMA}", f"command: {_flow(command)}"]
+    lines += [f"robot: {json.dumps(robot)}"] if robot else []
     lines.append("pairs:" if pairs else "pairs: []")
     lines += [f"  - {{links: {_flow(list(links))}, reason: {json.dumps(reason)}}}" for links, reason in pairs]
     return "\n".join(lines) + "\n"
