@@ -46,11 +46,13 @@ class PairSearch:
         samples: Random states.
         margin: Least distance of a pair that never touches [m].
         seed: Of the states.
+        soft: Parts whose links may touch each other.
     """
 
     samples: int = 20_000
     margin: float = 0.02
     seed: int = 0
+    soft: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -63,7 +65,6 @@ def disabled_pairs(
     robot: Robot,
     config: RobotConfig,
     search: PairSearch,
-    soft: Sequence[str] = (),
     deadline: float = np.inf,
     progress: Callable[[float], object] = lambda share: None,
 ) -> list[tuple[tuple[str, str], str]]:
@@ -75,18 +76,20 @@ def disabled_pairs(
         robot: The robot without its file of disabled pairs.
         config: Its file.
         search: Settings.
-        soft: Parts whose links may touch each other.
         deadline: By ``time.monotonic`` [s].
         progress: Called with the share of the work that is done.
+
+    Returns:
+        Links of each pair, and the reason.
 
     Raises:
         UnknownNameError: There is no part of a name.
     """
-    unknown = sorted({*soft} - {*robot.part_links})
+    unknown = sorted({*search.soft} - {*robot.part_links})
     if unknown:
         raise UnknownNameError("part", unknown[0], robot.part_links)
     pairs = [pair for pair in enabled_pairs(robot) if _same_root(robot, config, pair)]
-    inside = [pair for pair in pairs if (parts := _parts(robot, pair))[0] == parts[1] and parts[0] in soft]
+    inside = [pair for pair in pairs if (parts := _parts(robot, pair))[0] == parts[1] and parts[0] in search.soft]
     reasons = dict(zip(inside, _sweep(robot, inside), strict=True))
     rest = [pair for pair in pairs if pair not in reasons]
     reasons |= _decide(robot, rest, search, deadline, progress)
@@ -154,8 +157,8 @@ def _decide(
         if time.monotonic() > deadline:
             return reasons
         chunk = robot.random_state(rng, min(CHUNK, search.samples - done))
-        hit = SelfCollision(robot, left).hits(chunk).any(axis=0)
-        left = [pair for pair, touches in zip(left, hit, strict=True) if not touches]
+        hits = SelfCollision(robot, left).hits(chunk)
+        left = [pair for k, pair in enumerate(left) if not hits[:, k].any()]
         done += len(chunk)
         progress(0.5 * done / search.samples)
     if not left or time.monotonic() > deadline:
@@ -181,9 +184,10 @@ def _decide(
 def apart_over(robot: Robot, pair: Pair) -> str:
     """Return the joint over whose whole range a pair of geometries is proved apart, or an empty string.
 
-    The pair has this joint alone between them. A joint that moves by x moves no point of a body by more than r x, where r
-    is the largest distance of its points from the axis (or 1, for a prismatic joint). So where a distance exceeds r times
-    half the width of an interval around it, the pair is apart over all of it; other intervals are halved.
+    The pair has this joint alone between them. A joint that moves by x moves no point of a body by more than r x,
+    where r is the largest distance of its points from the axis (or 1, for a prismatic joint). So where a distance
+    exceeds r times half the width of an interval around it, the pair is apart over all of it; other intervals are
+    halved.
     """
     model = robot.model
     joints = [robot.geometry.geometryObjects[k].parentJoint for k in pair]
@@ -210,7 +214,7 @@ def apart_over(robot: Robot, pair: Pair) -> str:
 
 
 def _reach(item: pin.GeometryObject) -> float:
-    """Return the largest distance of a geometry's points from the origin of its joint, at least that from the axis [m]."""
+    """Return a bound on the distances of a geometry's points from its joint's axis, by those from its origin [m]."""
     item.geometry.computeLocalAABB()
     middle = item.placement.act(np.array(item.geometry.aabb_center))
     return float(np.linalg.norm(middle) + item.geometry.aabb_radius)

@@ -43,14 +43,12 @@ class Preparation:
         jobs: Processes at once.
         effort: Most thorough search for covers, 1 to 3.
         pairs: Settings of the search for pairs.
-        soft: Parts whose links may touch each other.
     """
 
     budget: float = 300.0
     jobs: int = 1
     effort: int = FULL
     pairs: PairSearch = PairSearch()
-    soft: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -102,8 +100,7 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
     covers_file = path.parent / (config.covers or f"{stem}.spheres.json")
     for file in (path, pairs_file, covers_file):
         check_writable(file)
-    pairs_deadline = time.monotonic() + PAIRS_SHARE * settings.budget
-    count, complete = _prepare_pairs(robot, config, pairs_file, settings, pairs_deadline, report)
+    count, complete = _prepare_pairs(robot, config, pairs_file, settings, report)
     _name_in(path, {"disabled_pairs": pairs_file})
     covers = _Covers(robot, covers_file, settings, deadline, report)
     covers.make(dict.fromkeys(covers.shapes, 1.0), 1)
@@ -118,18 +115,16 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
 
 
 def _prepare_pairs(
-    robot: Robot, config: RobotConfig, file: Path, settings: Preparation, deadline: float, report: Report
+    robot: Robot, config: RobotConfig, file: Path, settings: Preparation, report: Report
 ) -> tuple[int, bool]:
     """Write the file of disabled pairs unless it is this robot's; return the number, and whether all were decided."""
-    search = settings.pairs
+    search, deadline = settings.pairs, time.monotonic() + PAIRS_SHARE * settings.budget
     command = f"{COMMAND} --samples {search.samples} --margin {search.margin:g} --seed {search.seed}"
-    command += "".join(f" --soft {part}" for part in settings.soft)
+    command += "".join(f" --soft {part}" for part in search.soft)
     known = read_disabled_pairs_file(file) if file.exists() else None
     if known is not None and known.command == command and known.robot == digest(robot):
         return len(known.pairs), True
-    found = disabled_pairs(
-        robot, config, search, settings.soft, deadline, lambda share: report("pairs of links", share)
-    )  # fmt: skip
+    found = disabled_pairs(robot, config, search, deadline, lambda share: report("pairs of links", share))
     complete = time.monotonic() < deadline
     write_atomically(file, pairs_text(found, command if complete else f"{command}, stopped", digest(robot)).encode())
     return len(found), complete
