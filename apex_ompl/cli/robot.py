@@ -140,9 +140,7 @@ def _bars() -> Iterator[Report]:
 
     def report(stage: str, share: float) -> None:
         if stage not in bars:
-            bars[stage] = tqdm(
-                total=1.0, desc=stage, disable=None, bar_format="{desc}: {percentage:3.0f}% |{bar}| {elapsed}"
-            )
+            bars[stage] = tqdm(total=1.0, desc=stage, disable=None, bar_format=shown)
         bars[stage].update(share - bars[stage].n)
 
     try:
