@@ -79,9 +79,10 @@ def _is_chain(robot: Description, joints: tuple[str, ...]) -> bool:
 
 
 def is_finger(robot: Description, name: str) -> bool:
-    """Whether a joint is one of a hand: by its name, by its links, or as others that are there follow it."""
+    """Whether a joint is one of a hand: by its name, or the last of a chain and prismatic, or as others follow it."""
     joint = robot.joints[name]
-    if FINGER.search(name) or FINGER.search(joint.child):
+    last = not any(one.kind != "fixed" for link in robot.subtree(joint.child) for one in robot.below[link])
+    if FINGER.search(name) or (last and joint.kind == "prismatic") or (last and FINGER.search(joint.child)):
         return True
     return any(robot.joints[other].parent != joint.child for other in robot.followers(name))
 

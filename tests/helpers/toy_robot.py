@@ -7,7 +7,8 @@ from pathlib import Path
 
 AXES = ("0 0 1", "0 1 0", "0 1 0", "0 1 0")
 LIMIT = '<limit lower="-2" upper="2" velocity="2" effort="10"/>'
-BOX = '<link name="{name}"><collision><origin xyz="0 0 {middle}"/><geometry><box size="{size}"/></geometry></collision></link>'
+SHAPE = '<collision><origin xyz="0 0 {middle}"/><geometry><box size="{size}"/></geometry></collision>'
+BOX = '<link name="{name}">' + SHAPE + "</link>"
 SRDF = """<robot name="toy">
 <group name="manipulator"><chain base_link="stand" tip_link="part4"/></group>
 <group name="gripper"><joint name="grip1"/></group>

@@ -140,7 +140,8 @@ def test_a_link_may_be_called_world(tmp_path: Path) -> None:
 
 
 def test_a_mobile_base_stands_still(tmp_path: Path) -> None:
-    base = '<link name="odom"/><joint name="drive" type="planar"><parent link="odom"/><child link="stand"/></joint></robot>'
+    base = '<link name="odom"/><joint name="drive" type="planar"><parent link="odom"/><child link="stand"/></joint>'
+    base += "</robot>"
     made = new_robot(sources_of([str(write_toy(tmp_path, {"</robot>": base}))]), tmp_path / "toy.robot.yaml")
     assert "  drive: 0\n" in made.file.read_text() and load_robot(made.file).dof == 4
 
@@ -203,9 +204,11 @@ def test_limbs_are_found_without_fingers_and_legs(tmp_path: Path) -> None:
 def test_groups_of_an_srdf_are_joints_links_chains_and_groups(tmp_path: Path) -> None:
     robot = read_description(write_toy(tmp_path))
     (tmp_path / "g.srdf").write_text(
-        '<robot><group name="links"><link name="part2"/><link name="part1"/></group><group name="both"><group name="links"/>'
-        '<joint name="joint4"/><joint name="grip2"/></group><group name="itself"><group name="itself"/></group>'
-        '<group_state name="s" group="both"><joint name="joint1" value="0.5"/><joint name="no" value="1"/></group_state></robot>'
+        '<robot><group name="links"><link name="part2"/><link name="part1"/></group><group name="both">'
+        '<group name="links"/><joint name="joint4"/><joint name="grip2"/></group>'
+        '<group name="itself"><group name="itself"/></group>'
+        '<group_state name="s" group="both"><joint name="joint1" value="0.5"/><joint name="no" value="1"/>'
+        "</group_state></robot>"
     )
     found = read_semantics(tmp_path / "g.srdf", robot)
     assert found.groups == {"links": ("joint1", "joint2"), "both": ("joint1", "joint2", "joint4"), "itself": ()}
