@@ -337,7 +337,11 @@ def _mount(root: ET.Element, part: Part, child: str) -> None:
 def _lock_all(root: ET.Element, locked: Mapping[str, float]) -> None:
     """Turn joints into fixed joints at their values, and joints that mimic them at the values that follow."""
     joints = {str(joint.get("name")): joint for joint in root.findall("joint")}
-    mimics = {name: mimic for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
+    mimics = {
+        name: mimic
+        for name, joint in joints.items()
+        if (mimic := joint.find("mimic")) is not None and joint.get("type") != "fixed"
+    }
     for name, mimic in mimics.items():
         if mimic.get("joint") not in joints:
             raise RobotError(f"the joint {name!r} mimics {mimic.get('joint')!r}, which is no joint of the robot")

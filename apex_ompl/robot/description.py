@@ -161,8 +161,8 @@ def _joint(joint: ET.Element, name: str, file: Path) -> UrdfJoint:
         if not math.isfinite(velocity) or velocity == 0.0:
             velocity = math.nan
     ends = [str(end.get("link")) for key in ("parent", "child") if (end := joint.find(key)) is not None]
-    mimics = "" if mimic is None else mimic.get("joint", "")
-    if mimic is not None and not mimics:
+    mimics = "" if mimic is None or kind == "fixed" else mimic.get("joint", "")
+    if mimic is not None and kind != "fixed" and not mimics:
         raise RobotError(f"{file}: joint {name!r}: mimic: expected the name of a joint")
     return UrdfJoint(name, kind, ends[0], ends[1], lower, upper, velocity, mimics, origin_of(joint, f"joint {name!r}"))
 
