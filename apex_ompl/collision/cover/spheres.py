@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ LARGEST = 1e6  # numbers of a file beyond are a fault [m]
 GAPS = (0.02, 0.007, 0.0025)  # how far the balls of each level may protrude from the solid [m]
 MOST = (64, 96, 256)  # most leaves of a quick cover, of other covers, and of a mesh that is not convex
 FULL = 3  # the most thorough effort of a search
+QUICK_DEPTHS = 20_000  # grid points of a quick cover at which the depth of a mesh that is not convex is sampled
 QUICK = 4.0  # size of the boxes in which a quick cover is grown, relative to those of its proof
 
 
@@ -104,6 +106,8 @@ def make_cover(
     part = solid.parts[0]
     if isinstance(part, RoundBody) and part.capped:
         return _capsule(part, gaps[-1], most)
+    if effort == 1:
+        solid = replace(solid, depths=QUICK_DEPTHS)
     cover = search(solid, gaps, most, effort)
     made = _rounded(grow_to_cover(solid, cover, QUICK if effort == 1 else 1.0))
     if len(uncovered_boxes(solid, made)):
