@@ -123,7 +123,7 @@ def prepare(parsed: argparse.Namespace) -> int:
         ("covers", f"of {counted(sum(done.covers.values()), 'shape')}: {covers}"),
     ]
     if done.missing:
-        rows.append(("missing", f"{counted(done.missing, 'cover')}, which are made at run time"))
+        rows.append(("missing", f"{counted(done.missing, 'cover')}, made at run time until then"))
     if not done.thorough:
         rows.append(("next", "the time was not enough for all of it; the same command goes on"))
     print(Summary(str(parsed.robot), [*rows, *(("file", str(file)) for file in done.files)]))

@@ -14,6 +14,7 @@ import numpy as np
 
 from apex_ompl.robot.description import TURNING, Description, Semantics, UrdfJoint
 from apex_ompl.types import Array
+from apex_ompl.util.display import counted
 
 LEAST = 4  # joints of an arm
 FINGER = re.compile(r"finger|gripper|thumb|index|middle|ring_|little|pinky|hand_|jaw|knuckle|grip", re.I)
@@ -167,7 +168,7 @@ def hand_of(robot: Description, arm: Arm) -> tuple[dict[str, Any], str]:
     axis = point if np.linalg.norm(point) > 0.01 else np.array([0.0, 0.0, 1.0])
     axis = _direction(axis)
     record = {"palm": arm.palm, "point": _rounded(point, 4), "axis": axis, "fingers": axis}
-    towards = f"towards the middle of {len(ends)} tips" if np.linalg.norm(point) > 0.01 else "the palm's z"
+    towards = f"towards the middle of {counted(len(ends), 'tip')}" if np.linalg.norm(point) > 0.01 else "the palm's z"
     return record, f"palm {arm.palm}, axis and fingers {towards}"
 
 

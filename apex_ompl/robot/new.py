@@ -21,6 +21,7 @@ from apex_ompl.robot.home import Home, find_home
 from apex_ompl.robot.model import build_robot
 from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, shares_by_links
 from apex_ompl.robot.sources import expanded, is_xacro, urdf_file
+from apex_ompl.util.display import counted
 from apex_ompl.util.files import check_writable, suffix_of, write_atomically
 from apex_ompl.util.schema import validate, yaml_value
 from apex_ompl.util.validation import number_array
@@ -319,7 +320,9 @@ class _Writer:
             self.data["joints"][name] = {"home": value} | self.data["joints"][name]
         pairs = [(links, f"touch in {share:.0%} of {SAMPLES} random states") for links, share in sorted(always.items())]
         if pairs:
-            self.notes.append(f"{len(pairs)} pairs of links that always touch are disabled")
+            self.notes.append(
+                f"{counted(len(pairs), 'pair')} of links that touch at {ALWAYS:.0%} or more of random states: disabled"
+            )
         return pairs, robot.dof
 
     def _with_homes(self) -> dict[str, Any]:
