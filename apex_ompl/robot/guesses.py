@@ -178,7 +178,7 @@ def _direction(vector: Array) -> list[float]:
     near = int(np.argmax(np.abs(unit)))
     if abs(unit[near]) > 0.98:
         return [float(np.sign(unit[near])) if k == near else 0.0 for k in range(3)]
-    return [float(x) for x in unit]
+    return _rounded(unit, 9)
 
 
 def _rounded(values: Array, digits: int) -> list[float]:

@@ -8,6 +8,7 @@ that spoil most proofs are made anew, thoroughly, as long as the time lasts.
 from __future__ import annotations
 
 import multiprocessing
+import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -167,7 +168,7 @@ def _made(
         yield iter(())
         return
     _shapes = dict(shapes)
-    pool = multiprocessing.get_context("fork").Pool(min(jobs, len(shapes)))
+    pool = multiprocessing.get_context("fork").Pool(min(jobs, len(shapes)), _leave_interrupts)
     try:
         yield _until(deadline, pool.imap_unordered(_make, [(key, effort) for key in shapes]))
     finally:
@@ -177,6 +178,11 @@ def _made(
 
 
 _shapes: dict[str, coal.CollisionGeometry] = {}
+
+
+def _leave_interrupts() -> None:
+    """Leave Ctrl-C, which reaches all processes of a terminal, to the one that ends the others."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _make(job: tuple[str, int]) -> tuple[str, Cover]:
