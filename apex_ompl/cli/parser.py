@@ -12,6 +12,7 @@ import argparse
 import gc
 import io
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -120,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_see(commands)
     _add_benchmark(commands)
     _add_check(commands)
+    _add_robot(commands)
     for name, text in (
         ("problems", "list the ready-made problems and the suites"),
         ("planners", "list the planners and their parameters"),
@@ -363,3 +365,54 @@ def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = commands.add_parser("check", help="validate a problem, and print whether start and goal are free")
     parser.add_argument("problem", help=PROBLEM_HELP)
     parser.set_defaults(run="commands:check")
+
+
+def _add_robot(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser("robot", help="set up your own robot: new, check, prepare")
+    steps = parser.add_subparsers(dest="step", required=True, metavar="STEP")
+    new = steps.add_parser("new", help="write the robot file of a URDF, or of several in one cell")
+    new._negative_number_matcher = re.compile(r"^-[\d.]")  # --at -0.5,0,0,0 is no option
+    new.add_argument("urdf", nargs="+", metavar="URDF", help="a URDF or xacro file, or package://NAME/path")
+    new.add_argument(
+        "--srdf", action="append", default=[], metavar="FILE", help="with groups, states and disabled pairs; one for "
+        "all URDFs, or one for each",
+    )  # fmt: skip
+    new.add_argument(
+        "--at", action="append", default=[], metavar="X,Y,Z,YAW", help="where the root of a URDF stands [m, rad]; one "
+        "for each of several URDFs (default: the origin)",
+    )  # fmt: skip
+    new.add_argument(
+        "--package", action="append", default=[], metavar="NAME=FOLDER", help="the folder of package://NAME (default: "
+        "by ROS_PACKAGE_PATH, or above the URDF)",
+    )  # fmt: skip
+    new.add_argument("-o", "--out", type=Path, metavar="FILE", help="a new robot file (default: NAME.robot.yaml)")
+    new.set_defaults(run="robot:new")
+    check = steps.add_parser("check", help="name the faults of a robot file, and say what sphere covers prove")
+    check.add_argument("robot", help="robot file or name")
+    check.add_argument("--samples", type=int, default=1000, metavar="N", help="random states (default: %(default)s)")
+    check.add_argument("--json", action="store_true", help="print the numbers as JSON")
+    check.set_defaults(run="robot:check")
+    prepare = steps.add_parser("prepare", help="compute disabled pairs and sphere covers; resumes where it was stopped")
+    prepare.add_argument("robot", type=Path, metavar="FILE", help="robot file, which is made to name what is computed")
+    prepare.add_argument(
+        "--budget", type=float, default=300.0, metavar="SECONDS", help="that it may take; inf for as long as it takes "
+        "(default: %(default)s)",
+    )  # fmt: skip
+    prepare.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (default: %(default)s)")
+    prepare.add_argument(
+        "--effort", type=int, default=3, metavar="1, 2 or 3", help="of the covers (default: %(default)s)"
+    )
+    prepare.add_argument(
+        "--soft", action="append", default=[], metavar="PART", help="a part whose links may touch each other, as those "
+        "of a hand with one synergy",
+    )  # fmt: skip
+    prepare.add_argument(
+        "--samples", type=int, default=20_000, metavar="N", help="random states at which a pair that is disabled never "
+        "touches (default: %(default)s)",
+    )  # fmt: skip
+    prepare.add_argument(
+        "--margin", type=float, default=0.02, metavar="METRES", help="least distance of such a pair "
+        "(default: %(default)s)",
+    )  # fmt: skip
+    prepare.add_argument("--seed", type=int, default=0, help="of the states (default: %(default)s)")
+    prepare.set_defaults(run="robot:prepare")

@@ -16,11 +16,11 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.errors import MissingFileError, RobotError
-from apex_ompl.robot.config import Part, RobotConfig, resolve
+from apex_ompl.robot.config import Joint, Part, RobotConfig, resolve
 from apex_ompl.scene.bodies import pose_matrix
 from apex_ompl.scene.mesh_files import UPRIGHT, collada_asset
 from apex_ompl.types import Array
-from apex_ompl.util.files import opened
+from apex_ompl.util.files import opened, read_file
 
 INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 POSE = {"origin": {"xyz": 3, "rpy": 3}}
@@ -35,6 +35,7 @@ JOINT = {
 }  # fmt: skip
 """Elements -> their attributes that hold numbers, and how many."""
 
+WORLD = "world"  # the root link; a link of a part that has this name gets that of the part before it
 LIMITED = ("revolute", "prismatic")  # joints that need limits
 MOVING = (*LIMITED, "continuous", "planar")  # joints that need an axis
 TYPES = (*MOVING, "fixed", "floating")
@@ -130,7 +131,8 @@ class Composition:
     """A composed robot description.
 
     Attributes:
-        urdf: The URDF text, with absolute mesh paths and root link ``world``.
+        urdf: The URDF text, with absolute mesh paths and root link ``world``. Where a part has a link of that name, it
+            is called ``PART_world``.
         disabled_pairs: Link pairs that the SRDFs of the parts disable.
         part_links: Part name -> names of its links.
     """
@@ -154,22 +156,25 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
     """
     # Version 1.2 is the first in which URDF has capsules.
     root = ET.Element("robot", name=config.name, version="1.2")
-    ET.SubElement(root, "link", name="world")
-    links = {"world"}
+    ET.SubElement(root, "link", name=WORLD)
+    links = {WORLD}
     disabled: list[tuple[str, str]] = []
     part_links: dict[str, tuple[str, ...]] = {}
     files: list[Path] = []
+    packages = config.package_folders(folder)
     for part in config.parts:
         rename = _renamer(part)
-        urdf = resolve(part.urdf, folder, f"URDF of part {part.name!r}")
+        urdf = resolve(part.urdf, folder, f"URDF of part {part.name!r}", packages)
         files.append(urdf)
-        tree = _parse(urdf)
+        tree = parse_xml(urdf)
         _prune(tree, part)
+        for joint in tree.findall("joint"):
+            _give_limits(joint, config.joints.get(rename(joint.get("name", ""))))
         check_urdf(tree, urdf, [n for j in tree.findall("joint") if rename(n := j.get("name", "")) in config.locked])
         names = []
         for element in [*tree.findall("link"), *tree.findall("joint")]:
             _rename_element(element, rename)
-            _locate_meshes(element, (urdf.parent, folder), part)
+            _locate_meshes(element, (urdf.parent, folder), packages)
             if element.tag == "link":
                 names.append(element.get("name", ""))
             for limit in element.findall("limit") if element.get("type") in LIMITED else ():
@@ -190,8 +195,8 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
         links.update(names)
         part_links[part.name] = tuple(names)
         if part.srdf:
-            files.append(resolve(part.srdf, folder, f"SRDF of part {part.name!r}"))
-            found = _parse(files[-1]).iter("disable_collisions")
+            files.append(resolve(part.srdf, folder, f"SRDF of part {part.name!r}", packages))
+            found = parse_xml(files[-1]).iter("disable_collisions")
             pairs = [(rename(e.get("link1", "")), rename(e.get("link2", ""))) for e in found]
             disabled += [(a, b) for a, b in pairs if a in names and b in names]
     _lock_all(root, config.locked)
@@ -199,13 +204,39 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
     return Composition(ET.tostring(root, encoding="unicode"), disabled, part_links, tuple(dict.fromkeys(files)))
 
 
-def _parse(path: Path) -> ET.Element:
+def parse_xml(path: Path) -> ET.Element:
+    """Return the root of a URDF or an SRDF, whose element is ``robot``.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        RobotError: It is not XML, or its root is another element.
+    """
     try:
-        return ET.parse(path).getroot()
-    except ET.ParseError as error:
+        root = ET.fromstring(read_file(path, "robot description"))
+    except (ET.ParseError, ValueError, LookupError) as error:
         raise RobotError(f"{path}: not valid XML ({error})") from error
-    except OSError as error:
-        raise MissingFileError(str(path), "robot description", str(error.strerror)) from error
+    if root.tag != "robot":
+        raise RobotError(f"{path}: expected the element <robot>, got <{root.tag}>")
+    return root
+
+
+def _give_limits(joint: ET.Element, given: Joint | None) -> None:
+    """Write limits of the robot file into a planned joint; a continuous joint with a range becomes revolute."""
+    if given is None or joint.get("type") not in (*LIMITED, "continuous"):
+        return
+    values = {"lower": given.lower, "upper": given.upper, "velocity": given.velocity}
+    known = {name: f"{value:.17g}" for name, value in values.items() if value is not None}
+    bounded = {"lower", "upper"} <= known.keys()
+    if joint.get("type") == "continuous" and not bounded:
+        return
+    if joint.get("type") == "continuous":
+        joint.set("type", "revolute")
+    if known and bounded:
+        limit = joint.find("limit")
+        limit = ET.SubElement(joint, "limit") if limit is None else limit
+        limit.attrib.update(known)
+        if "velocity" in known:
+            limit.attrib.setdefault("effort", "0")
 
 
 def _renamer(part: Part) -> Callable[[str], str]:
@@ -214,7 +245,8 @@ def _renamer(part: Part) -> Callable[[str], str]:
             if name.startswith(old):
                 name = new + name.removeprefix(old)
                 break
-        return part.prefix + name
+        name = part.prefix + name
+        return f"{part.name}_{WORLD}" if name == WORLD else name
 
     return rename
 
@@ -247,14 +279,14 @@ def _rename_element(element: ET.Element, rename: Callable[[str], str]) -> None:
             inner.set(key, rename(inner.get(key, "")))
 
 
-def _locate_meshes(element: ET.Element, folders: tuple[Path, Path], part: Part) -> None:
+def _locate_meshes(element: ET.Element, folders: tuple[Path, Path], packages: Mapping[str, Path]) -> None:
     """Put the paths of mesh files into place: they start at the URDF's folder, else at the robot file's."""
     for kind in ("visual", "collision"):
         for holder in element.findall(kind):
             for mesh in holder.iter("mesh"):
                 role = f"{kind} mesh of link {element.get('name')!r}"
                 try:
-                    path = _resolved(mesh.get("filename", ""), folders, role)
+                    path = _resolved(mesh.get("filename", ""), folders, role, packages)
                 except MissingFileError:
                     if kind == "collision":
                         raise
@@ -281,7 +313,7 @@ def _scale_and_turn(holder: ET.Element, mesh: ET.Element, path: Path, role: str)
     elif path.suffix.lower() in (".glb", ".gltf"):
         upright = np.eye(4)
         upright[:3, :3] = UPRIGHT["Y_UP"]
-        pose, scale = _origin(holder, role) @ upright, scale[[0, 2, 1]]  # in the axes of the file
+        pose, scale = origin_of(holder, role) @ upright, scale[[0, 2, 1]]  # in the axes of the file
         for origin in holder.findall("origin"):
             holder.remove(origin)
         _set_origin(holder, pose)
@@ -289,10 +321,10 @@ def _scale_and_turn(holder: ET.Element, mesh: ET.Element, path: Path, role: str)
         mesh.set("scale", " ".join(f"{v:.17g}" for v in scale))
 
 
-def _resolved(name: str, folders: tuple[Path, Path], role: str) -> Path:
+def _resolved(name: str, folders: tuple[Path, Path], role: str, packages: Mapping[str, Path]) -> Path:
     with suppress(MissingFileError):
-        return resolve(name, folders[0], role)
-    return resolve(name, folders[1], role)
+        return resolve(name, folders[0], role, packages)
+    return resolve(name, folders[1], role, packages)
 
 
 def _mount(root: ET.Element, part: Part, child: str) -> None:
@@ -305,7 +337,11 @@ def _mount(root: ET.Element, part: Part, child: str) -> None:
 def _lock_all(root: ET.Element, locked: Mapping[str, float]) -> None:
     """Turn joints into fixed joints at their values, and joints that mimic them at the values that follow."""
     joints = {str(joint.get("name")): joint for joint in root.findall("joint")}
-    mimics = {name: mimic for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
+    mimics = {
+        name: mimic
+        for name, joint in joints.items()
+        if (mimic := joint.find("mimic")) is not None and joint.get("type") != "fixed"
+    }
     for name, mimic in mimics.items():
         if mimic.get("joint") not in joints:
             raise RobotError(f"the joint {name!r} mimics {mimic.get('joint')!r}, which is no joint of the robot")
@@ -325,8 +361,12 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
     if joint is None:
         raise RobotError(f"locked: no joint {name!r} in the URDF")
     kind = joint.get("type")
-    if kind not in ("revolute", "continuous", "prismatic"):
-        raise RobotError(f"locked: the joint {name!r} is {kind}, expected revolute, continuous or prismatic")
+    if kind in ("floating", "planar") and value == 0.0:
+        _fix(joint, origin_of(joint, f"joint {name!r}"))
+        return
+    if kind not in (*LIMITED, "continuous"):
+        expected = "0 for a floating or planar joint, else revolute, continuous or prismatic"
+        raise RobotError(f"locked: the joint {name!r} is {kind} and its value {value:g}, expected {expected}")
     axis_element = joint.find("axis")
     text = "1 0 0" if axis_element is None else axis_element.get("xyz", "1 0 0")
     axis = numbers(text, 3, f"axis of joint {name!r}")
@@ -336,15 +376,19 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
         motion[:3, 3] = value * axis
     else:
         motion[:3, :3] = pin.exp3(value * axis)
-    placement = _origin(joint, f"joint {name!r}")
+    _fix(joint, origin_of(joint, f"joint {name!r}") @ motion)
+
+
+def _fix(joint: ET.Element, pose: Array) -> None:
+    """Make a joint fixed, its child at a pose in its parent, shape (4, 4) [m]."""
     for tag in ("origin", "axis", "limit", "mimic", "dynamics", "safety_controller"):
         for element in joint.findall(tag):
             joint.remove(element)
     joint.set("type", "fixed")
-    _set_origin(joint, placement @ motion)
+    _set_origin(joint, pose)
 
 
-def _origin(element: ET.Element, what: str) -> Array:
+def origin_of(element: ET.Element, what: str) -> Array:
     """Return the pose given by the origin of an element, shape (4, 4) [m]."""
     origin, pose = element.find("origin"), np.eye(4)
     if origin is not None:

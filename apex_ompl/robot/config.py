@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, Self
@@ -100,6 +101,7 @@ class RobotConfig(StrictModel):
         hands: Hands by name.
         disabled_pairs: File of further link pairs that are not checked for collision.
         covers: File of sphere covers of the links; without it coarser covers are made at run time.
+        packages: Package name -> its folder, for ``package://NAME/...``; relative to the robot file.
     """
 
     schema_id: Literal["apex-ompl/robot/1"] = Field(alias="schema")
@@ -113,6 +115,11 @@ class RobotConfig(StrictModel):
     hands: dict[str, Hand] = {}
     disabled_pairs: str | None = None
     covers: str | None = None
+    packages: dict[str, str] = {}
+
+    def package_folders(self, folder: Path) -> dict[str, Path]:
+        """Return package name -> folder for a robot file in ``folder``."""
+        return {name: folder / path for name, path in self.packages.items()}
 
     @model_validator(mode="after")
     def _known_joints(self) -> Self:
@@ -134,9 +141,16 @@ class DisabledPair(StrictModel):
 
 
 class DisabledPairs(StrictModel):
-    """A file of disabled pairs."""
+    """A file of disabled pairs.
+
+    Attributes:
+        command: The command that made it.
+        robot: The digest of the robot that it was made for.
+    """
 
     schema_id: Literal["apex-ompl/disabled-pairs/1"] = Field(alias="schema")
+    command: str = ""
+    robot: str = ""
     pairs: tuple[DisabledPair, ...]
 
 
@@ -153,15 +167,24 @@ def read_config(path: Path) -> RobotConfig:
     return config.model_copy(update={"fixtures": tuple(located(f, path.parent) for f in config.fixtures)})
 
 
-def read_disabled_pairs(path: Path) -> list[tuple[str, str]]:
+def read_disabled_pairs_file(path: Path) -> DisabledPairs:
     """Read a file of disabled pairs.
 
     Raises:
         MissingFileError: It cannot be read.
         FileFormatError: It does not follow the schema.
     """
-    data = read_yaml(path, "file of disabled pairs")
-    return [pair.links for pair in validate(DisabledPairs, data, str(path)).pairs]
+    return validate(DisabledPairs, read_yaml(path, "file of disabled pairs"), str(path))
+
+
+def read_disabled_pairs(path: Path) -> list[tuple[str, str]]:
+    """Read the pairs of links of a file of disabled pairs.
+
+    Raises:
+        MissingFileError: It cannot be read.
+        FileFormatError: It does not follow the schema.
+    """
+    return [pair.links for pair in read_disabled_pairs_file(path).pairs]
 
 
 @cache
@@ -180,7 +203,7 @@ def package_roots() -> tuple[Path, ...]:
     return tuple(root for root in roots if root.is_dir())
 
 
-def resolve(uri: str, relative_to: Path, role: str) -> Path:
+def resolve(uri: str, relative_to: Path, role: str, packages: Mapping[str, Path] | None = None) -> Path:
     """Return the file that ``uri`` names.
 
     Args:
@@ -188,16 +211,22 @@ def resolve(uri: str, relative_to: Path, role: str) -> Path:
             ``relative_to``.
         relative_to: Folder for relative paths.
         role: Description of the file for the error.
+        packages: Package name -> its folder. Packages that are not named are looked up in :func:`package_roots`, then
+            in the folders above ``relative_to`` and beside them.
 
     Raises:
         MissingFileError: No such file.
     """
     if uri.startswith("package://"):
         rest = uri.removeprefix("package://")
-        for root in package_roots():
-            if is_file(root / rest):
-                return root / rest
-        package = rest.split("/", 1)[0]
+        package, _, inside = rest.partition("/")
+        places = [packages[package] / inside] if packages and package in packages else []
+        places += [root / rest for root in package_roots()]
+        for above in (here := relative_to.resolve(), *here.parents):  # in the package, or in one beside it
+            places += [above / inside] * (above.name == package) + [above / rest]
+        found = next(filter(is_file, places), None)
+        if found is not None:
+            return found
         extra = ", as the extra 'robots' of apex_ompl does" if package == EXTRA else ""
         raise MissingFileError(uri, role, f"not under any package folder; is {package!r} installed{extra}?")
     path = Path(uri.removeprefix("file://"))

@@ -1,6 +1,6 @@
 """How many spheres pay: covers of different gaps, by what proofs and checkers cost with them.
 
-The covers are files that scripts/make_covers.py wrote with different --gaps. For each: leaves of an arm link and of
+The covers are files of make_cover's with different gaps. For each: leaves of an arm link and of
 the whole robot, how large and how far from the meshes they are, the share of free states that they prove, the cost of
 proofs and of the two stages of the checker, of free 256-state paths, and of rrtconnect's search on two problems.
 

@@ -89,10 +89,22 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         "--jobs 1 --keep --quiet --out results",
     ),
     ((0,), "report results --out report"),
+    (
+        (0,),
+        "robot new arm.urdf --srdf arm.srdf --at 0.1,0,0,1.5 --package meshes=. --out arm.robot.yaml",
+    ),
+    ((0,), "robot check arm.robot.yaml --samples 100 --json"),
+    (
+        (0,),
+        "robot prepare arm.robot.yaml --budget 120 --jobs 2 --effort 1 --samples 600 --margin 0.01 --seed 1 --soft arm",
+    ),
+    ((0,), "robot check arm.robot.yaml"),
+    ((2,), "robot new gone.urdf"),
 )
 WRITTEN = (
     "plan.npz", "motion.traj.yaml", "path.json", "run.npz", "real.json", "plan.png", "plan.svg", "run.png", "page.html",
-    "converted.yaml", "camera.yaml", "carried.yaml", "seen.png", "report/report.html", "report/report.md",
+    "arm.robot.yaml", "arm.spheres.json", "converted.yaml", "camera.yaml", "carried.yaml", "seen.png",
+    "report/report.html", "report/report.md",
 )  # fmt: skip
 
 
@@ -128,10 +140,24 @@ def _write_inputs() -> None:
         planner.problem(start, goal, "own").save("own.yaml")
         home = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
     Path("params.yaml").write_text("range: 0.5\n")
+    _write_arm()
     _write_frames(robot)
     names, values = ", ".join(["panda_joint1", *robot.joint_names[1:]]), ", ".join(map(str, home.values()))
     Path("scene.yaml").write_text(SCENE.replace("[panda_joint1]", f"[{names}]").replace("[0.0]", f"[{values}]"))
     Path("request.yaml").write_text(REQUEST)
+
+
+def _write_arm() -> None:
+    """Write the URDF and the SRDF of an arm of four bars."""
+    bar = '<collision><origin xyz="0 0 0.1"/><geometry><cylinder radius="0.02" length="0.16"/></geometry></collision>'
+    text = f'<link name="bar0">{bar}</link>'
+    for k in range(1, 5):
+        text += f'<link name="bar{k}">{bar}</link><joint name="turn{k}" type="revolute"><parent link="bar{k - 1}"/>'
+        text += f'<child link="bar{k}"/><origin xyz="0 0 0.25"/><axis xyz="{k % 2} {1 - k % 2} 0"/>'
+        text += '<limit lower="-1.5" upper="1.5" velocity="2" effort="1"/></joint>'
+    Path("arm.urdf").write_text(f'<robot name="arm">{text}</robot>')
+    chain = '<group name="arm"><chain base_link="bar0" tip_link="bar4"/></group>'
+    Path("arm.srdf").write_text(f'<robot name="arm">{chain}</robot>')
 
 
 def _write_frames(robot: apex_ompl.Robot) -> None:
@@ -187,11 +213,18 @@ def _serve() -> Iterator[str]:
 
 def _known() -> Iterator[str]:
     """Yield the names of all commands, and the longest name of each of their options."""
-    actions: list[Any] = _parser()._actions
-    (commands,) = (one for one in actions if isinstance(one, argparse._SubParsersAction))
-    yield from commands.choices
-    for parser in commands.choices.values():
-        for action in parser._actions:
-            option = max(action.option_strings, key=len, default="")
-            if option and option != "--help" and option not in ELSEWHERE:
-                yield option
+    yield from _words_of(_parser())
+
+
+def _words_of(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """Yield the names of a parser's commands and options, and those of each of its commands."""
+    actions: list[Any] = parser._actions
+    for action in actions:
+        if isinstance(action, argparse._SubParsersAction):
+            yield from action.choices
+            for inner in action.choices.values():
+                yield from _words_of(inner)
+            continue
+        option = max(action.option_strings, key=len, default="")
+        if option and option not in ELSEWHERE | {"--help"}:
+            yield option

@@ -6,17 +6,13 @@ import importlib.util
 import re
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 from support import ROOT
 
-from apex_ompl.collision import CollisionChecker
-from apex_ompl.errors import ParameterError, UnknownNameError
-from apex_ompl.robot import load_robot
-from apex_ompl.robot.config import read_disabled_pairs
+from apex_ompl.errors import ParameterError
 from apex_ompl.util.entry_point import run_script
 
 
@@ -107,41 +103,3 @@ def test_scripts_take_what_their_usage_says(name: str, arguments: str, monkeypat
         monkeypatch.setattr(argparse.ArgumentParser, way, parsed)
     with pytest.raises(EOFError):
         module.main()
-
-
-MY_ROBOT = """schema: apex-ompl/robot/1
-name: my
-parts: [{name: arm, urdf: my.urdf}]
-joints:
-  one: {acceleration: 1, jerk: 9}
-  two: {acceleration: 1, jerk: 9}
-"""
-BOX = '<collision><geometry><box size="0.05 0.05 0.2"/></geometry></collision>'
-TURN = '<origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>'
-MY_URDF = f"""<robot name="my"><link name="base">{BOX}</link><link name="on">{BOX}</link><link name="tip">{BOX}</link>
-<joint name="one" type="revolute"><parent link="base"/><child link="on"/>{TURN}
-<joint name="two" type="revolute"><parent link="on"/><child link="tip"/>{TURN}</robot>"""
-
-
-@pytest.mark.parametrize("named", [False, True])
-def test_files_of_a_robot_are_made_before_and_after_it_names_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], named: bool
-) -> None:
-    """As docs/robots.md tells: no hand is soft, and the robot's file may name what is not there yet."""
-    pairs, covers = ("a.yaml", "b.json") if named else ("my.pairs.yaml", "my.spheres.json")
-    names = f"disabled_pairs: {pairs}\ncovers: {covers}\n"
-    (tmp_path / "my.robot.yaml").write_text(MY_ROBOT + names * named)
-    (tmp_path / "my.urdf").write_text(MY_URDF)
-    derive, make = (load_script(name, monkeypatch) for name in ("derive_disabled_pairs", "make_covers"))
-    for _ in range(2):  # again, with the files there
-        for script, more in ((derive, ["--samples", "600"]), (make, ["--effort", "1"])):
-            monkeypatch.setattr(sys, "argv", [script.__name__, str(tmp_path / "my.robot.yaml"), *more])
-            script.main()
-        (tmp_path / "my.robot.yaml").write_text(MY_ROBOT + names)
-        robot = load_robot(tmp_path / "my.robot.yaml")
-        assert robot.covers == tmp_path / covers
-        assert read_disabled_pairs(tmp_path / pairs) == [("base", "on"), ("base", "tip"), ("on", "tip")]
-        assert not robot.geometry.collisionPairs and CollisionChecker(robot).is_free(robot.home)
-    monkeypatch.setattr(sys, "argv", ["derive", str(tmp_path / "my.robot.yaml"), "--soft", "hand"])
-    with pytest.raises(UnknownNameError, match="unknown part 'hand'"):
-        derive.main()

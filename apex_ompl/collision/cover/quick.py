@@ -197,7 +197,7 @@ _quick: dict[str, Cover] = {}  # by shape key
 def covers_of(robot: Robot, shapes: Sequence[coal.CollisionGeometry]) -> list[Cover]:
     """Return a cover of each shape: one from the robot's file, or a rough one made now.
 
-    Covers in files are not checked here: ``scripts/make_covers.py`` writes only proved covers, and the tests prove
+    Covers in files are not checked here: ``apex-ompl robot prepare`` writes only proved covers, and the tests prove
     again those that ship.
 
     Raises:

@@ -233,10 +233,12 @@ class Solid:
     Attributes:
         parts: The parts.
         skin: Points on the surface of a solid of several parts, shape (N, 3) [m]; None for a single part.
+        depths: Number of grid points at which the depth of a solid of several parts is sampled.
     """
 
     parts: tuple[Part, ...]
     skin: Array | None = None
+    depths: int = FIELD
 
     @property
     def low(self) -> Array:
@@ -265,7 +267,7 @@ class Solid:
     @cached_property
     def _field(self) -> Field:
         assert self.skin is not None
-        return Field.over(self.low, self.high, self.skin, self.contains, FIELD)
+        return Field.over(self.low, self.high, self.skin, self.contains, self.depths)
 
     def surface(self, spacing: float) -> Array:
         """Return points on the surfaces of the parts about ``spacing`` apart, shape (N, 3) [m]."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,13 +27,25 @@ from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import check_version, read_json
 
-__all__ = ["GAPS", "Cover", "make_cover", "quality", "read_covers", "shape_key", "unproved", "write_covers"]
+__all__ = [
+    "GAPS",
+    "Cover",
+    "make_cover",
+    "quality",
+    "read_covers",
+    "read_efforts",
+    "shape_key",
+    "unproved",
+    "write_covers",
+]
 
 SCHEMA = "apex-ompl/spheres/1"
 COLUMNS = ["x", "y", "z", "radius", "first child", "children"]
 LARGEST = 1e6  # numbers of a file beyond are a fault [m]
 GAPS = (0.02, 0.007, 0.0025)  # how far the balls of each level may protrude from the solid [m]
 MOST = (64, 96, 256)  # most leaves of a quick cover, of other covers, and of a mesh that is not convex
+FULL = 3  # the most thorough effort of a search
+QUICK_DEPTHS = 20_000  # grid points of a quick cover at which the depth of a mesh that is not convex is sampled
 QUICK = 4.0  # size of the boxes in which a quick cover is grown, relative to those of its proof
 
 
@@ -93,6 +106,8 @@ def make_cover(
     part = solid.parts[0]
     if isinstance(part, RoundBody) and part.capped:
         return _capsule(part, gaps[-1], most)
+    if effort == 1:
+        solid = replace(solid, depths=QUICK_DEPTHS)
     cover = search(solid, gaps, most, effort)
     made = _rounded(grow_to_cover(solid, cover, QUICK if effort == 1 else 1.0))
     if len(uncovered_boxes(solid, made)):
@@ -138,8 +153,13 @@ def quality(
     return ratio, float(np.mean(gaps)), float(np.max(gaps))
 
 
-def write_covers(path: Path | str, covers: Mapping[str, Cover]) -> None:
+def write_covers(path: Path | str, covers: Mapping[str, Cover], efforts: Mapping[str, int] | None = None) -> None:
     """Write covers by the keys of their shapes, rounded outward to micrometers so that they stay proved.
+
+    Args:
+        path: The file.
+        covers: Shape key -> cover.
+        efforts: Shape key -> effort of the search where it was less than the full one.
 
     Raises:
         MissingFileError: The file cannot be written.
@@ -152,7 +172,10 @@ def write_covers(path: Path | str, covers: Mapping[str, Cover]) -> None:
             for c, r, f, n in zip(cover.centers, cover.radii, cover.first, cover.count, strict=True)
         ]
         rows.append(f"  {json.dumps(key)}: [\n" + ",\n".join(f"   {json.dumps(ball)}" for ball in balls) + "\n  ]")
-    text = f'{{\n "schema": {json.dumps(SCHEMA)},\n "columns": {json.dumps(COLUMNS)},\n "covers": {{\n'
+    text = f'{{\n "schema": {json.dumps(SCHEMA)},\n "columns": {json.dumps(COLUMNS)},\n'
+    less = {key: efforts[key] for key in sorted(covers) if efforts and efforts.get(key, FULL) < FULL}
+    text += f' "efforts": {json.dumps(less)},\n' if less else ""
+    text += ' "covers": {\n'
     write_atomically(Path(path), (text + ",\n".join(rows) + "\n }\n}\n").encode())
 
 
@@ -163,6 +186,26 @@ def read_covers(path: Path | str) -> dict[str, Cover]:
         MissingFileError: The file cannot be read.
         FileFormatError: It does not hold covers.
     """
+    name, data = str(path), _covers_in(path)
+    return {key: _cover_of(rows, name, f"covers.{key}") for key, rows in data["covers"].items()}
+
+
+def read_efforts(path: Path | str) -> dict[str, int]:
+    """Read the efforts by which the covers of a file were made: shape key -> 1, 2 or 3.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: It does not hold covers.
+    """
+    data = _covers_in(path)
+    less = data.get("efforts", {})
+    if not isinstance(less, dict) or any(type(effort) is not int for effort in less.values()):
+        raise FileFormatError(str(path), "efforts", less, "expected a mapping of shape keys to 1, 2 or 3")
+    return {key: less.get(key, FULL) for key in data["covers"]}
+
+
+def _covers_in(path: Path | str) -> dict[str, Any]:
+    """Return the content of a file of covers, without a look at the covers."""
     name = str(path)
     data = read_json(Path(path), "sphere covers")
     check_version(data, SCHEMA, path)
@@ -170,7 +213,7 @@ def read_covers(path: Path | str) -> dict[str, Cover]:
         raise FileFormatError(name, "columns", data.get("columns"), f"expected {COLUMNS}")
     if not isinstance(data.get("covers"), dict):
         raise FileFormatError(name, "covers", data.get("covers"), "expected a mapping of shape keys to balls")
-    return {key: _cover_of(rows, name, f"covers.{key}") for key, rows in data["covers"].items()}
+    return data
 
 
 def _is_number(value: Any) -> bool:

@@ -1,0 +1,271 @@
+"""Pairs of links that need no collision check: those that touch always, or by design, and those that never do.
+
+The pairs considered are those that no SRDF lists and whose links stand on the same root part (a hand against itself
+and its own arm), never one arm against the other. Three findings disable a pair:
+
+- by design: both links belong to a soft part, a hand whose fingers touch each other and the palm as its synergy closes;
+- always: in collision at every random state;
+- never: free at every random state, and still ``margin`` apart at the closest state that a local search finds; or, with
+  one joint between them, proved apart over its whole range.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from apex_ompl.collision.hulls import convex_hull
+from apex_ompl.errors import UnknownNameError
+from apex_ompl.robot.config import RobotConfig
+from apex_ompl.robot.model import Robot, link_of
+from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, are_neighbors, enabled_pairs, links_of_pair
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_integer, check_positive, check_seed
+
+Pair = tuple[int, int]
+
+FIRST = 500  # states at which all pairs are checked; those that touch at none remain
+CHUNK = 1000  # states between looks at the time
+STARTS = 4  # closest states from which a local search starts
+DISTANCES = 2000  # states at which distances are measured
+STEPS = 60  # of a local search
+FINEST = 1e-4  # distance below which no proof is tried [m]
+MOST_INTERVALS = 4000  # of the range of a joint
+SWEEP = 1001  # positions of the synergies of soft parts
+
+
+@dataclass(frozen=True)
+class PairSearch:
+    """Settings of the search for pairs.
+
+    Attributes:
+        samples: Random states.
+        margin: Least distance of a pair that never touches [m].
+        seed: Of the states.
+        soft: Parts whose links may touch each other.
+    """
+
+    samples: int = 20_000
+    margin: float = 0.02
+    seed: int = 0
+    soft: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        check_integer(self.samples, "samples", 1)
+        check_positive(self.margin, "margin", "a positive distance [m]")
+        check_seed(self.seed)
+
+
+def disabled_pairs(
+    robot: Robot,
+    config: RobotConfig,
+    search: PairSearch,
+    deadline: float = np.inf,
+    progress: Callable[[float], object] = lambda share: None,
+) -> list[tuple[tuple[str, str], str]]:
+    """Return the pairs of links to disable, sorted, with their reasons.
+
+    A pair that is not decided before the deadline stays enabled.
+
+    Args:
+        robot: The robot without its file of disabled pairs.
+        config: Its file.
+        search: Settings.
+        deadline: By ``time.monotonic`` [s].
+        progress: Called with the share of the work that is done.
+
+    Returns:
+        Links of each pair, and the reason.
+
+    Raises:
+        UnknownNameError: There is no part of a name.
+    """
+    unknown = sorted({*search.soft} - {*robot.part_links})
+    if unknown:
+        raise UnknownNameError("part", unknown[0], robot.part_links)
+    pairs = [pair for pair in enabled_pairs(robot) if _same_root(robot, config, pair)]
+    inside = [pair for pair in pairs if (parts := _parts(robot, pair))[0] == parts[1] and parts[0] in search.soft]
+    reasons = dict(zip(inside, _sweep(robot, inside), strict=True))
+    rest = [pair for pair in pairs if pair not in reasons]
+    reasons |= _decide(robot, rest, search, deadline, progress)
+    return _by_links(robot, pairs, reasons)
+
+
+def _by_links(robot: Robot, pairs: Sequence[Pair], reasons: dict[Pair, str]) -> list[tuple[tuple[str, str], str]]:
+    """Return pairs of links all of whose geometries have a reason, with the first that is no mere "never"."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for pair in pairs:
+        found.setdefault(links_of_pair(robot, pair), []).append(reasons.get(pair, ""))
+    chosen = {links: some for links, some in found.items() if all(some)}
+    return sorted((links, min(some, key=lambda reason: reason.startswith("never"))) for links, some in chosen.items())
+
+
+def _parts(robot: Robot, pair: Pair) -> tuple[str, str]:
+    first, second = (robot.part_of(link_of(robot.model, robot.geometry.geometryObjects[k])) for k in pair)
+    return first, second
+
+
+def _same_root(robot: Robot, config: RobotConfig, pair: Pair) -> bool:
+    """Whether the chains of parts that carry the links of a pair start at the same part."""
+    above = {part.name: part.parent for part in config.parts}
+
+    def root(part: str) -> str:
+        return part if above[part] == "world" else root(robot.part_of(above[part]))
+
+    first, second = map(root, _parts(robot, pair))
+    return first == second
+
+
+def _sweep(robot: Robot, pairs: list[Pair]) -> list[str]:
+    """Return the reason for each pair inside a soft part, from a sweep of all synergies at once."""
+    checks = SelfCollision(robot, pairs)
+    synergies = {hand.synergy for hand in robot.hands.values()}
+    moved = [k for k, name in enumerate(robot.joint_names) if name in synergies]
+    first = np.full(len(pairs), np.nan)
+    for s in np.linspace(0.0, 1.0, SWEEP) if pairs else ():
+        q = robot.home.copy()
+        q[moved] = s
+        first[np.isnan(first) & checks.colliding(q)] = s
+    return ["never in a sweep of the synergy" if np.isnan(s) else f"by design, from synergy {s:.3f}" for s in first]
+
+
+def _decide(
+    robot: Robot, pairs: list[Pair], search: PairSearch, deadline: float, progress: Callable[[float], object]
+) -> dict[Pair, str]:
+    """Return pair -> reason for the pairs that always or never touch."""
+    rng = np.random.default_rng(search.seed)
+    first = min(FIRST, search.samples)
+    counts = SelfCollision(robot, pairs).hits(robot.random_state(rng, first)).sum(axis=0)
+    enough = ALWAYS * first
+    reasons = {
+        pair: f"always, in {count} of {first} samples"
+        for pair, count in zip(pairs, counts, strict=True)
+        if count >= enough
+    }
+    untouched = [pair for pair, count in zip(pairs, counts, strict=True) if count == 0]
+    reasons |= {
+        pair: f"never, proved over the range of {joint}" for pair in untouched if (joint := apart_over(robot, pair))
+    }
+    left = [pair for pair in untouched if pair not in reasons]
+    done = first
+    while done < search.samples and left:
+        if time.monotonic() > deadline:
+            return reasons
+        chunk = robot.random_state(rng, min(CHUNK, search.samples - done))
+        hits = SelfCollision(robot, left).hits(chunk)
+        left = [pair for k, pair in enumerate(left) if not hits[:, k].any()]
+        done += len(chunk)
+        progress(0.5 * done / search.samples)
+    if not left or time.monotonic() > deadline:
+        return reasons
+    states = robot.random_state(rng, DISTANCES)
+    hulls = _Pairs(robot, left, hulls=True)
+    table = np.array([hulls.distances(q) for q in states])
+    for k, pair in enumerate(left):
+        if time.monotonic() > deadline:
+            break
+        progress(0.5 + 0.5 * k / len(left))
+        closest = float(table[:, k].min())
+        alone = _Pairs(robot, [pair], hulls=True)
+        for q in states[np.argsort(table[:, k])[:STARTS]]:
+            if closest < search.margin:
+                break
+            closest = min(closest, alone.closest(q))
+        if closest >= search.margin:
+            reasons[pair] = f"never in {search.samples} samples, closest found {closest * 1e3:.0f} mm"
+    return reasons
+
+
+def apart_over(robot: Robot, pair: Pair) -> str:
+    """Return the joint over whose whole range a pair of geometries is proved apart, or an empty string.
+
+    The pair has this joint alone between them. A joint that moves by x moves no point of a body by more than r x,
+    where r is the largest distance of its points from the axis (or 1, for a prismatic joint). So where a distance
+    exceeds r times half the width of an interval around it, the pair is apart over all of it; other intervals are
+    halved.
+    """
+    model = robot.model
+    joints = [robot.geometry.geometryObjects[k].parentJoint for k in pair]
+    if not are_neighbors(robot, pair):
+        return ""
+    moved = joints[1] if model.parents[joints[1]] == joints[0] else joints[0]
+    if model.names[moved] not in robot.joint_names:  # it mimics another
+        return ""
+    k = robot.joint_names.index(model.names[moved])
+    item = robot.geometry.geometryObjects[pair[joints.index(moved)]]
+    reach = 1.0 if "P" in model.joints[moved].shortname() else _reach(item)
+    alone = _Pairs(robot, [pair])
+    intervals = [(float(robot.limits.lower[k]), float(robot.limits.upper[k]))]
+    for low, high in intervals:
+        q = robot.home.copy()
+        q[k] = 0.5 * (low + high)
+        distance = float(alone.distances(q)[0])
+        if distance > 0.5 * (high - low) * reach + FINEST:
+            continue
+        if distance < 2.0 * FINEST or len(intervals) > MOST_INTERVALS:
+            return ""
+        intervals += [(low, q[k]), (q[k], high)]
+    return str(robot.joint_names[k])
+
+
+def _reach(item: pin.GeometryObject) -> float:
+    """Return a bound on the distances of a geometry's points from its joint's axis, by those from its origin [m]."""
+    item.geometry.computeLocalAABB()
+    middle = item.placement.act(np.array(item.geometry.aabb_center))
+    return float(np.linalg.norm(middle) + item.geometry.aabb_radius)
+
+
+class _Pairs:
+    """Distances between chosen pairs, by their shapes or by the convex hulls of these."""
+
+    def __init__(self, robot: Robot, pairs: list[Pair], *, hulls: bool = False) -> None:
+        self.robot, self.data = robot, robot.model.createData()
+        self.geometry = robot.geometry.copy()
+        self.geometry.removeAllCollisionPairs()
+        used = {k for pair in pairs for k in pair}
+        for pair in pairs:
+            self.geometry.addCollisionPair(pin.CollisionPair(*pair))
+        for k in used if hulls else ():
+            self.geometry.geometryObjects[k].geometry = convex_hull(robot.geometry.geometryObjects[k].geometry)
+        self.results = self.geometry.createData()
+
+    def distances(self, q: Array) -> Array:
+        """Return the signed distances at a state, shape (pairs,) [m]."""
+        q = self.robot.to_pinocchio(q)
+        pin.computeDistances(self.robot.model, self.data, self.geometry, self.results, q)
+        return np.array([result.min_distance for result in self.results.distanceResults], float)
+
+    def closest(self, q: Array) -> float:
+        """Return the least distance of a single pair that a descent from a state finds [m].
+
+        The direction is that of the signed gradient by finite differences, scaled by the ranges of the joints; the step
+        is halved where it does not help.
+        """
+        low, high = self.robot.limits.lower, self.robot.limits.upper
+        span = np.minimum(high - low, 2.0 * np.pi)
+        best, step = float(self.distances(q)[0]), 0.1
+        for _ in range(STEPS):
+            slope = np.zeros(len(q))
+            for k in range(len(q)):
+                moved = q.copy()
+                change = 1e-4 * span[k] * (1.0 if q[k] + 1e-4 * span[k] <= high[k] else -1.0)
+                moved[k] += change
+                slope[k] = (self.distances(moved)[0] - best) / change * span[k]
+            size = float(np.linalg.norm(slope))
+            if size < 1e-9 or best <= 0.0:
+                break
+            while step > 1e-4:
+                tried = np.clip(q - step * span * slope / size, low, high)
+                value = float(self.distances(tried)[0])
+                if value < best - 1e-7:
+                    q, best, step = tried, value, min(2.0 * step, 0.2)
+                    break
+                step *= 0.5
+            else:
+                break
+        return best
