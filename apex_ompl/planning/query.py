@@ -16,8 +16,9 @@ from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_name, finite_array
 
-State = Mapping[str, float] | ArrayLike
-"""A state: values by joint name, or all of them in the robot's order, shape (dof,) [rad; synergies 0..1]."""
+State = str | Mapping[str, float] | ArrayLike
+"""A state: the name of one of the robot's poses, values by joint name, or all of them in the robot's order, shape
+(dof,) [rad; synergies 0..1]."""
 
 GOAL_STATES, GOAL_ATTEMPTS = 8, 200  # states that are taken of a user's sampler, and draws for them
 
@@ -48,7 +49,10 @@ def joint_values(robot: Robot, state: State, name: str) -> dict[str, float]:
 
     Raises:
         ParameterError: It has not the robot's shape, or a number that is not finite.
+        UnknownNameError: The robot has no pose of that name.
     """
+    if isinstance(state, str):
+        state = robot.poses[check_name(state, f"pose of {robot.name} as {name}", robot.poses)]
     if isinstance(state, Mapping):
         given = {str(joint): finite_array(value, f"{name}.{joint}") for joint, value in state.items()}
         for joint, value in given.items():
@@ -75,6 +79,19 @@ def state_array(robot: Robot, state: State, name: str) -> Array:
         if joint not in values:
             raise ParameterError(name, f"{len(values)} of {robot.dof} joints", f"all; {joint!r} is missing")
     return np.array([values[joint] for joint in robot.joint_names])
+
+
+def pose_targets(targets: PoseTarget | Sequence[PoseTarget]) -> tuple[PoseTarget, ...]:
+    """Return one pose or several as a tuple.
+
+    Raises:
+        ParameterError: They are no poses, or there is none.
+        FileFormatError: Two poses are given for one frame.
+    """
+    several = (targets,) if isinstance(targets, PoseTarget) else targets
+    if not isinstance(several, Sequence) or not several or not all(isinstance(one, PoseTarget) for one in several):
+        raise ParameterError("targets", targets, "a PoseTarget, or several")
+    return validate(Goal, {"poses": tuple(several)}, "targets").poses or ()
 
 
 def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal:
@@ -131,9 +148,9 @@ def sampled_goals(
 
 
 def _several(target: Any) -> Sequence[Any]:
-    if isinstance(target, Mapping):
+    if isinstance(target, str | Mapping):
         return [target]
-    if isinstance(target, Sequence) and target and isinstance(target[0], Mapping):
+    if isinstance(target, Sequence) and target and any(isinstance(one, str | Mapping) for one in target):
         return target
     values = finite_array(target, "goal")
     return list(np.atleast_2d(values)) if values.size else []

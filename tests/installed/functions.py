@@ -95,6 +95,7 @@ def _code(member: Any) -> CodeType | None:
 def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
+    from apex_ompl.planning import IKResult, IKSolution, ProofResult
     from apex_ompl.planning.planner import check_arguments, kept_planner
     from apex_ompl.scene import OnPlane
 
@@ -123,6 +124,10 @@ def _use_planner() -> None:
         assert len(result.path.sample(0.1)) > 1
         line = planner.plan_line(home, pose, frame="left_hand_palm", timeout=20.0)
         assert line and line.share == 1.0
+        found = planner.ik(pose, near="home", count=4)
+        assert found and found.states.shape == (4, robot.dof) and isinstance(found, IKResult) and found[0].clearance > 0
+        assert isinstance(found[0], IKSolution) and planner.fk("home", "left_hand").shape == (4, 4)
+        assert isinstance(planner.prove(result.path), ProofResult) and planner.checker.is_free(home)
         plane = OnPlane(frame="left_hand_palm", normal=(1.0, 0.0, 0.0))
         assert planner.plan(home, pose, timeout=20.0, constraints=[plane]).constraint_bound
         assert planner.simple_setup(home, home + 0.01) and planner.problem(home, home).name == "world"
