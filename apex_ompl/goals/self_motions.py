@@ -95,7 +95,7 @@ def search(
 
 def _redundancy(inverse: IKSolver, q: Array) -> int:
     """Return how many directions leave the residual as it is at a state, shape (dof,)."""
-    singular: Array = np.linalg.svd(inverse.residual(q)[1][:, inverse.free], compute_uv=False)
+    singular = np.linalg.svd(inverse.residual(q)[1][:, inverse.free])[1]
     return len(inverse.free) - _rank(singular)
 
 

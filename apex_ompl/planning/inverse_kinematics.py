@@ -16,6 +16,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.frames import Frame
 from apex_ompl.constraints.links import Links
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.pose_goal import PoseGoal
@@ -215,9 +216,7 @@ class _Part:
     def out_of_reach(self) -> str:
         """Return why a pose is farther away than the arm is long, or nothing where that is not shown."""
         for pose, frame in zip(self.goal.poses, self.goal.frames, strict=True):
-            number = self.robot.link_frame(frame.link)
-            fault = _too_far(self.robot, pose, number, frame.pose, frame.axial, self.base, self.inverse.free)
-            if fault:
+            if fault := _too_far(self.robot, pose, frame, self.base, self.inverse.free):
                 return fault
         return ""
 
@@ -245,15 +244,13 @@ class _Part:
         return {cause: n / len(missed) for cause, n in causes.most_common()}
 
 
-def _too_far(
-    robot: Robot, pose: PoseTarget, number: int, tool: Array, axial: bool, base: Array, free: NDArray[np.int64]
-) -> str:
+def _too_far(robot: Robot, pose: PoseTarget, frame: Frame, base: Array, free: NDArray[np.int64]) -> str:
     """Return why a pose is out of reach by the length of the links, or nothing.
 
     The distance between the origins of the first and the last moved joint is at most the sum of the offsets between
     joints in between; an orientation that is given places the origin of the last one, and otherwise the frame's own.
     """
-    model = robot.model
+    model, number, whole = robot.model, robot.link_frame(frame.link), pose.orientation is not None and not frame.axial
     data = model.createData()
     pin.framesForwardKinematics(model, data, robot.to_pinocchio(base))
     chain, joint = list[int](), int(model.frames[number].parentJoint)
@@ -266,9 +263,9 @@ def _too_far(
         return ""
     first, last = chain[moved[0]], chain[-1]
     length = sum(float(np.linalg.norm(model.jointPlacements[j].translation)) for j in chain[moved[0] + 1 :])
-    local = np.array(model.frames[number].placement.homogeneous) @ tool
+    local = np.array(model.frames[number].placement.homogeneous) @ frame.pose
     wanted, slack = np.asarray(pose.position, float), pose.tolerance.position
-    if pose.orientation is not None and not axial:
+    if pose.orientation is not None and whole:
         wanted = (pose_matrix(pose.position, pose.orientation) @ np.linalg.inv(local))[:3, 3]
         slack += pose.tolerance.angle * float(np.linalg.norm(local[:3, 3]))
     else:
@@ -276,7 +273,7 @@ def _too_far(
     distance = float(np.linalg.norm(wanted - data.oMi[first].translation))
     if distance <= length + slack + ROUNDING:
         return ""
-    what = pose.frame if last == first or pose.orientation is None or axial else f"the joint {model.names[last]}"
+    what = pose.frame if last == first or not whole else f"the joint {model.names[last]}"
     return (
         f"{pose.frame} is out of reach: {what} has to be {distance:.3f} m from {model.names[first]}, "
         f"and the links in between are {length:.3f} m long"

@@ -539,7 +539,8 @@ class MotionPlanner:
         Args:
             targets: A pose, or several that are reached together.
             near: State near which the solutions are wanted: the nearest come first. By default those with the largest
-                clearance come first, by millimeters, then those nearest to home. Joints that move none of the frames stay as there, or as at home.
+                clearance come first, by millimeters, then those nearest to home. Joints that move none of the frames
+                stay as there, or as at home.
             group: Joints that may move, by names of groups and joints; all by default.
             count: Most solutions.
             descents: Most descents from random states, for each arm.

@@ -367,9 +367,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     for array in (effort, *poses.values(), *vars(limits).values(), *groups.values(), order):
         array.flags.writeable = False
     return Robot(
-        name=config.name, joint_names=names, limits=limits, effort=effort, home=home, poses=poses,
-        groups=groups, hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
-        urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
+        name=config.name, joint_names=names, limits=limits, effort=effort, home=home, poses=poses, groups=groups,
+        hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures,
+        part_links=composition.part_links, urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
     )  # fmt: skip
 
 

@@ -31,6 +31,7 @@ def run(root: Path) -> list[str]:
     made: set[type] = set()
     with _traced(called, made):
         _use_planner()
+        _use_kinematics()
         _use_tasks()
         _use_records()
         _use_trajectories()
@@ -95,7 +96,6 @@ def _code(member: Any) -> CodeType | None:
 def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
-    from apex_ompl.planning import IKResult, IKSolution, ProofResult
     from apex_ompl.planning.planner import check_arguments, kept_planner
     from apex_ompl.scene import OnPlane
 
@@ -124,10 +124,6 @@ def _use_planner() -> None:
         assert len(result.path.sample(0.1)) > 1
         line = planner.plan_line(home, pose, frame="left_hand_palm", timeout=20.0)
         assert line and line.share == 1.0
-        found = planner.ik(pose, near="home", count=4)
-        assert found and found.states.shape == (4, robot.dof) and isinstance(found, IKResult) and found[0].clearance > 0
-        assert isinstance(found[0], IKSolution) and planner.fk("home", "left_hand").shape == (4, 4)
-        assert isinstance(planner.prove(result.path), ProofResult) and planner.checker.is_free(home)
         plane = OnPlane(frame="left_hand_palm", normal=(1.0, 0.0, 0.0))
         assert planner.plan(home, pose, timeout=20.0, constraints=[plane]).constraint_bound
         assert planner.simple_setup(home, home + 0.01) and planner.problem(home, home).name == "world"
@@ -146,6 +142,20 @@ def _use_planner() -> None:
         planner.plan(home, home, timeout=-1.0)
     except apex_ompl.ApexError as error:
         assert "timeout" in str(error)
+
+
+def _use_kinematics() -> None:
+    """Inverse and forward kinematics, and paths of a user's own."""
+    import apex_ompl
+    from apex_ompl.planning import IKResult, IKSolution, ProofResult
+
+    with apex_ompl.MotionPlanner("panda") as planner:
+        home = planner.robot.home
+        pose = apex_ompl.PoseTarget(frame="hand", position=tuple(planner.fk("home", "hand")[:3, 3]))
+        found = planner.ik(pose, near="home", count=4)
+        assert isinstance(found, IKResult) and found.states.shape == (4, 7) and len(found) == len(list(found)) == 4
+        assert isinstance(found[0], IKSolution) and found[0].clearance > 0.0
+        assert isinstance(planner.prove([home, home]), ProofResult) and planner.checker.is_free(home)
 
 
 def _use_tasks() -> None:
