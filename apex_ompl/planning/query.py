@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -31,12 +32,24 @@ class GoalSampler(Protocol):
         """Return a state that reaches the goal, shape (dof,), or None where this draw finds none."""
 
 
+@dataclass(frozen=True)
+class AnyOf:
+    """Goals of which any will do, such as hundreds of grasps; which one, the motion to it decides.
+
+    Attributes:
+        goals: The goals: states, by name, joint or in order, poses, lists of poses that are reached together,
+            alignments, or goals of problems.
+    """
+
+    goals: Sequence[Any]
+
+
 Group = str | Sequence[str]
 """Joints that a plan moves: name of a group of the robot, or names of groups and joints."""
 
-Target = State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal | GoalSampler
+Target = State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal | AnyOf | GoalSampler
 """A goal: a state, several of which any will do, shape (goals, dof), poses of one frame or more, an alignment of held
-objects, the goal of a problem, or an object that draws states."""
+objects, the goal of a problem, any of several goals, or an object that draws states."""
 
 
 def joint_values(robot: Robot, state: State, name: str) -> dict[str, float]:
@@ -108,6 +121,11 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
     """
     if isinstance(target, Goal):
         return target
+    if isinstance(target, AnyOf):
+        if isinstance(target.goals, str | Mapping) or not isinstance(target.goals, Iterable):
+            raise ParameterError("goal", target.goals, "several goals in AnyOf")
+        records = [goal_record(robot, one, held) for one in target.goals]
+        return validate(Goal, {"any_of": tuple(records)}, "goal")
     if isinstance(target, Alignment):
         return Goal(alignment=target)
     if isinstance(target, PoseTarget):

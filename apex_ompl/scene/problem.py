@@ -36,7 +36,7 @@ from apex_ompl.util.schema import StrictModel, check_version, dump_yaml, read_ya
 SCHEMA = "apex-ompl/problem/1"
 
 
-GOALS = ("joints", "alignment", "poses")
+GOALS = ("joints", "alignment", "poses", "any_of")
 """Kinds of goals."""
 
 JointValues = dict[str, float]
@@ -113,24 +113,50 @@ class Alignment(StrictModel):
 class PoseTarget(StrictModel):
     """A pose in the world that a frame of the robot is to reach.
 
+    With ``free_turn``, ``lower`` and ``upper`` it is a region of poses, by the axes of the wanted pose.
+
     Attributes:
         frame: Name of a hand, whose frame is that of its palm with the grasp point as origin; of a link; or of a held
             object, whose frame is its own, or its contact face with the outward axis as z where it has one.
         position: Position of the frame's origin [m].
         orientation: Orientation of the frame, a quaternion xyzw; any by default. Of a contact face its z axis counts.
         tolerance: How far from it counts as reached.
+        free_turn: Axis of the frame about which it may be turned.
+        turn: Least and largest angle by which it may be turned about that axis [rad]; by default any.
+        lower: Least position of the frame's origin relative to ``position``, along the axes of the wanted pose [m].
+        upper: Largest one.
     """
 
     frame: Name
     position: Vector
     orientation: Quaternion | None = None
     tolerance: PoseTolerance = PoseTolerance()
+    free_turn: Literal["x", "y", "z"] | None = None
+    turn: tuple[float, float] | None = None
+    lower: Vector = (0.0, 0.0, 0.0)
+    upper: Vector = (0.0, 0.0, 0.0)
+
+    @model_validator(mode="after")
+    def _a_region(self) -> Self:
+        if self.free_turn is not None and self.orientation is None:
+            raise ValueError("expected an orientation beside free_turn")
+        if self.turn is not None and (self.free_turn is None or not -np.pi <= self.turn[0] <= self.turn[1] <= np.pi):
+            raise ValueError("expected turn: [least, largest] inside [-3.1416, 3.1416] beside a free_turn")
+        if not all(low <= 0.0 <= high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise ValueError("expected a lower of 0 or less and an upper of 0 or more")
+        return self
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it is one pose but for a free turn, and no region of positions or angles."""
+        return self.turn is None and not any(self.lower) and not any(self.upper)
 
 
 class Goal(StrictModel):
-    """A goal: joint configurations of which one is to be reached, an alignment of held objects, or poses.
+    """A goal: joint configurations of which one is to be reached, an alignment of held objects, poses, or several.
 
     Poses are reached all at once, by one frame each; joints that move none of the frames stay as they are at the start.
+    Of the goals in ``any_of``, any will do.
     """
 
     joints: (
@@ -143,6 +169,7 @@ class Goal(StrictModel):
     ) = None
     alignment: Alignment | None = None
     poses: Annotated[tuple[PoseTarget, ...], Field(min_length=1)] | None = None
+    any_of: Annotated[tuple[Goal, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
@@ -153,7 +180,15 @@ class Goal(StrictModel):
         twice = sorted({name for name in frames if frames.count(name) > 1})
         if twice:
             raise ValueError(f"more than one pose is given for {twice[0]!r}")
+        if any(one.any_of is not None for one in self.any_of or ()):
+            raise ValueError("expected no any_of inside of any_of")
         return self
+
+    def with_joints(self, values: Mapping[str, float]) -> Goal:
+        """Return the goal with values of joints that its joint configurations leave out."""
+        if self.any_of is not None:
+            return Goal(any_of=tuple(one.with_joints(values) for one in self.any_of))
+        return self if self.joints is None else Goal(joints=tuple({**values, **given} for given in self.joints))
 
 
 class MoveStep(Step):
@@ -169,6 +204,8 @@ class MoveStep(Step):
     @property
     def subject(self) -> str:
         """What is moved, or the kind of goal."""
+        if self.goal.any_of is not None:
+            return counted(len(self.goal.any_of), "goal")
         if self.goal.poses is not None:
             return " and ".join(pose.frame for pose in self.goal.poses)
         if self.goal.alignment is None:
