@@ -125,6 +125,8 @@ class GoalSamples:
         """Reason for which there is no state, in one sentence; empty when there is one."""
         if len(self.states):
             return ""
+        if not self.attempts and not self.converged:
+            return "none of the goal states is inside the limits and leaves the joints that are not planned as they are"
         if ON_CONSTRAINTS in self.best:
             return f"no state at the goal on the constraints was found in {self.attempts} attempts"
         if self.converged:
