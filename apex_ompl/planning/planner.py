@@ -262,6 +262,7 @@ class MotionPlanner:
         check_options(options, OPTIONS)
         with running(), self._lock:
             problem = self.problem(start, goal, name, group, options.get("seed", 0))
+            _check_is_no_line(problem)
             return self._plan(problem, planner, started, PlanOptions(group=group, **options))
 
     def plan_problem(
@@ -279,6 +280,7 @@ class MotionPlanner:
         """
         started = time.perf_counter()
         check_options(options, OPTIONS)
+        _check_is_no_line(problem)
         with running(), self._lock:
             with unforked():
                 self.world.load(problem)
@@ -304,6 +306,7 @@ class MotionPlanner:
             with unforked():
                 from apex_ompl.planning.tasks import plan_task
 
+                problem = problem.with_lines
                 self.world.load(problem)
             given = PlanOptions(**options)
 
@@ -678,6 +681,16 @@ def _from_rest(options: PlanOptions) -> PlanOptions:
     if not isinstance(timing, bool):
         timing = replace(timing, start_velocity=(), start_acceleration=(), minimum_duration=0.0)
     return replace(options, timing=timing, leave_contact=0.0, constraints=())
+
+
+def _check_is_no_line(problem: Problem) -> None:
+    """Check that a goal has no approach.
+
+    Raises:
+        ParameterError: It has one.
+    """
+    for frame, approach in problem.goal.approaches.items():
+        raise ParameterError("goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task")
 
 
 def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
 
-from apex_ompl.errors import FileFormatError, nearest_name
-from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located
+from apex_ompl.errors import FileFormatError, ParameterError, nearest_name
+from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located, pose_matrix
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
 from apex_ompl.scene.steps import (
     GraspStep,
@@ -125,6 +125,7 @@ class PoseTarget(StrictModel):
         turn: Least and largest angle by which it may be turned about that axis [rad]; by default any.
         lower: Least position of the frame's origin relative to ``position``, along the axes of the wanted pose [m].
         upper: Largest one.
+        approach: Displacement along the frame's own axes by which it goes to the pose, straight, without turning [m].
     """
 
     frame: Name
@@ -135,6 +136,7 @@ class PoseTarget(StrictModel):
     turn: tuple[float, float] | None = None
     lower: Vector = (0.0, 0.0, 0.0)
     upper: Vector = (0.0, 0.0, 0.0)
+    approach: Vector | None = None
 
     @model_validator(mode="after")
     def _a_region(self) -> Self:
@@ -144,7 +146,23 @@ class PoseTarget(StrictModel):
             raise ValueError("expected turn: [least, largest] inside [-3.1416, 3.1416] beside a free_turn")
         if not all(low <= 0.0 <= high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError("expected a lower of 0 or less and an upper of 0 or more")
+        if self.approach is not None and (self.orientation is None or max(map(abs, self.approach)) < 1e-6):
+            raise ValueError("expected an approach that is not zero, beside an orientation")
+        if self.approach is not None and self.free_turn is not None:
+            along = ["xyz"[k] for k in range(3) if self.approach[k]]
+            if along != [self.free_turn]:
+                raise ValueError(f"expected an approach along the axis of the free turn, {self.free_turn}")
         return self
+
+    @property
+    def before_approach(self) -> PoseTarget:
+        """The pose where the approach starts, without one."""
+        if self.approach is None:
+            return self
+        wanted = pose_matrix(self.position, self.orientation or (0.0, 0.0, 0.0, 1.0))
+        by = [sum(wanted[i, k] * self.approach[k] for k in range(3)) for i in range(3)]
+        position = tuple(float(self.position[i] - by[i]) for i in range(3))
+        return self.model_copy(update={"position": position, "approach": None})
 
     @property
     def is_exact(self) -> bool:
@@ -183,6 +201,27 @@ class Goal(StrictModel):
         if any(one.any_of is not None for one in self.any_of or ()):
             raise ValueError("expected no any_of inside of any_of")
         return self
+
+    @property
+    def approaches(self) -> dict[str, Vector]:
+        """Frames that go straight to their poses -> displacement along their own axes [m].
+
+        Raises:
+            ParameterError: The goals in ``any_of`` have different ones.
+        """
+        each = [one.approaches for one in self.any_of or ()]
+        each = each or [{pose.frame: pose.approach for pose in self.poses or () if pose.approach is not None}]
+        if any(one != each[0] for one in each):
+            raise ParameterError("approach", each, "the same frames and approaches in all goals of any_of")
+        return each[0]
+
+    @property
+    def before_approach(self) -> Goal:
+        """The goal with the poses where approaches start, and without these."""
+        if self.any_of is not None:
+            return self.model_copy(update={"any_of": tuple(one.before_approach for one in self.any_of)})
+        poses = None if self.poses is None else tuple(pose.before_approach for pose in self.poses)
+        return self.model_copy(update={"poses": poses})
 
     def with_joints(self, values: Mapping[str, float]) -> Goal:
         """Return the goal with values of joints that its joint configurations leave out."""
@@ -291,6 +330,19 @@ class Problem(StrictModel):
         return tuple(o.name for o in self.scene if o.moving)
 
     @property
+    def is_task(self) -> bool:
+        """Whether there are steps after the goal, or a straight line to it, which :func:`apex_ompl.plan_task` plans."""
+        return bool(self.after or self.goal.approaches)
+
+    @property
+    def with_lines(self) -> Problem:
+        """The problem with a step ``line`` in place of each approach."""
+        steps = [step for given in self.after for step in _with_lines(given)]
+        goal, *lines = _with_lines(MoveStep(goal=self.goal))
+        assert isinstance(goal, MoveStep)
+        return self.model_copy(update={"goal": goal.goal, "after": (*lines, *steps)})
+
+    @property
     def still(self) -> Problem:
         """The problem without the obstacles that move, and without pairs that name them."""
         pairs = tuple(pair for pair in self.allowed if not {*pair} & {*self.moving})
@@ -370,6 +422,23 @@ class Problem(StrictModel):
         if self.robot.endswith((".yaml", ".yml")):
             update["robot"] = os.path.normpath(folder / self.robot)
         return self.model_copy(update=update)
+
+
+def _with_lines(step: AnyStep) -> list[AnyStep]:
+    """Return a step, and for each approach of its goal a line after it.
+
+    Frames with the same approach go in step.
+    """
+    if not isinstance(step, MoveStep):
+        return [step]
+    approaches = step.goal.approaches
+    if not approaches:
+        return [step]
+    frames = dict[Vector, list[str]]()
+    for frame, by in approaches.items():
+        frames.setdefault(by, []).append(frame)
+    lines = [LineStep(frame=tuple(names), by=by, axes="frame") for by, names in frames.items()]
+    return [step.model_copy(update={"goal": step.goal.before_approach}), *lines]
 
 
 def _in_order(values: Mapping[str, float], joint_names: Sequence[str], source: str, field: str) -> Array:

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from apex_ompl import AnyOf, ApexError, MotionPlanner, PlanStatus, PoseTarget, Problem, Robot, plan
+from apex_ompl import AnyOf, ApexError, MotionPlanner, PlanStatus, PoseTarget, Problem, Robot, plan, plan_task
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
@@ -63,15 +63,15 @@ def test_the_nearest_of_many_poses_is_about_as_near_as_the_best_of_them_alone(ro
 
 def test_poses_and_joint_configurations_are_mixed(robot: Robot, tmp_path: Path) -> None:
     near, far = robot.home.copy(), robot.home.copy()
-    near[0] += 0.3
-    far[0] -= 0.9
+    near[0] += 0.5
+    far[0] -= 1.3
     pose = near_home(robot, 5, 1, 0.5)[0]
     with MotionPlanner(robot) as planner:
         planner.world.add(name="ball", sphere={"radius": 0.02}, position=(0.5, 0.0, 1.2))
         result = planner.plan("home", AnyOf([far, pose, near]), timeout=20.0)
         assert result and np.array_equal(result.path.states[-1], near)
         problem = planner.problem("home", AnyOf([far, pose, near]))
-        blocked = hand_pose(robot, near).translation
+        blocked = robot.link_pose(near, "left_hand_palm")[:3, 3]
         planner.world.move("ball", tuple(blocked))
         other = planner.plan("home", AnyOf([far, pose, near]), timeout=20.0, group="left_arm")
         assert other and not np.array_equal(other.path.states[-1], near)
@@ -182,6 +182,9 @@ def test_faulty_goals_are_named(robot: Robot, goal: Any, message: str) -> None:
         ({"turn": (0.0, 1.0)}, "beside a free_turn"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (1.0, 0.0)}, "least, largest"),
         ({"lower": (0.1, 0.0, 0.0)}, "a lower of 0 or less"),
+        ({"approach": (0.0, 0.0, 0.1)}, "beside an orientation"),
+        ({"orientation": (0, 0, 0, 1), "approach": (0.0, 0.0, 0.0)}, "an approach that is not zero"),
+        ({"orientation": (0, 0, 0, 1), "free_turn": "x", "approach": (0, 0, 0.1)}, "along the axis of the free turn"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "w"}, "'x', 'y' or 'z'"),
     ],
 )
@@ -202,3 +205,32 @@ def test_a_region_of_a_problem_is_any_of_the_drawn_poses(robot: Robot) -> None:
         problem = planner.problem("home", target(hand_pose(robot, robot.home), upper=(0.1, 0.0, 0.0)))
     goal = workspace_goal(robot, problem)
     assert isinstance(goal, AnyGoal) and len(goal.members) > 1 and goal.errors(robot.home) == {"goal": 0.0}
+
+
+def test_an_approach_ends_straight_along_an_axis_of_the_hand(robot: Robot, tmp_path: Path) -> None:
+    at = hand_pose(robot, robot.home + 0.1 * np.sin(np.arange(robot.dof)))
+    lower = at.copy()
+    lower.translation[2] -= 0.03
+    by = np.array([0.0, 0.05, 0.0])
+    goals = AnyOf([target(at, approach=tuple(by)), target(lower, approach=tuple(by))])
+    with MotionPlanner(robot) as planner:
+        problem = planner.problem("home", goals)
+        with pytest.raises(ApexError, match="a plan by plan_task"):
+            planner.plan("home", goals)
+        with pytest.raises(ApexError, match="a plan by plan_task"):
+            planner.plan_problem(problem)
+        both = planner.problem("home", AnyOf([target(at, approach=tuple(by)), target(lower)]))
+        with pytest.raises(ApexError, match="the same frames and approaches"):
+            planner.plan_task(both)
+    assert problem.is_task and not problem.with_lines.goal.approaches
+    problem.save(tmp_path / "approach.yaml")
+    task = plan_task(tmp_path / "approach.yaml", timeout=20.0)
+    assert task and [step.title for step in task.steps] == ["goal", "line left_hand"]
+    line = task.steps[-1].path.states
+    ends = [hand_pose(robot, q) for q in (line[0], line[-1])]
+    offs = [min(np.abs(pin.log6(pose.actInv(ends[1])).vector).max() for pose in (at, lower))]
+    assert offs[0] < 2e-3
+    assert np.allclose(ends[0].actInv(ends[1]).translation, by, atol=1e-3)
+    for q in line:
+        off = ends[0].actInv(hand_pose(robot, q))
+        assert np.linalg.norm(np.delete(off.translation, 1)) < 3e-4 and np.linalg.norm(pin.log3(off.rotation)) < 3e-3
