@@ -305,8 +305,9 @@ class MotionPlanner:
         with running(), self._lock:
             with unforked():
                 from apex_ompl.planning.tasks import plan_task
+                from apex_ompl.scene.problem import with_lines
 
-                problem = problem.with_lines
+                problem = with_lines(problem)
                 self.world.load(problem)
             given = PlanOptions(**options)
 

@@ -330,19 +330,6 @@ class Problem(StrictModel):
         return tuple(o.name for o in self.scene if o.moving)
 
     @property
-    def is_task(self) -> bool:
-        """Whether there are steps after the goal, or a straight line to it, which :func:`apex_ompl.plan_task` plans."""
-        return bool(self.after or self.goal.approaches)
-
-    @property
-    def with_lines(self) -> Problem:
-        """The problem with a step ``line`` in place of each approach."""
-        steps = [step for given in self.after for step in _with_lines(given)]
-        goal, *lines = _with_lines(MoveStep(goal=self.goal))
-        assert isinstance(goal, MoveStep)
-        return self.model_copy(update={"goal": goal.goal, "after": (*lines, *steps)})
-
-    @property
     def still(self) -> Problem:
         """The problem without the obstacles that move, and without pairs that name them."""
         pairs = tuple(pair for pair in self.allowed if not {*pair} & {*self.moving})
@@ -422,6 +409,18 @@ class Problem(StrictModel):
         if self.robot.endswith((".yaml", ".yml")):
             update["robot"] = os.path.normpath(folder / self.robot)
         return self.model_copy(update=update)
+
+
+def with_lines(problem: Problem) -> Problem:
+    """Return a problem with a step ``line`` in place of each approach.
+
+    Raises:
+        ParameterError: The goals in an ``any_of`` have different approaches.
+    """
+    steps = [step for given in problem.after for step in _with_lines(given)]
+    goal, *lines = _with_lines(MoveStep(goal=problem.goal))
+    assert isinstance(goal, MoveStep)
+    return problem.model_copy(update={"goal": goal.goal, "after": (*lines, *steps)})
 
 
 def _with_lines(step: AnyStep) -> list[AnyStep]:

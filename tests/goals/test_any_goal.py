@@ -20,6 +20,7 @@ from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene import OnPlane
 from apex_ompl.scene.constraints import PoseTolerance
+from apex_ompl.scene.problem import with_lines
 
 
 def hand_pose(robot: Robot, q: np.ndarray, hand: str = "left_hand") -> pin.SE3:
@@ -222,7 +223,7 @@ def test_an_approach_ends_straight_along_an_axis_of_the_hand(robot: Robot, tmp_p
         both = planner.problem("home", AnyOf([target(at, approach=tuple(by)), target(lower)]))
         with pytest.raises(ApexError, match="the same frames and approaches"):
             planner.plan_task(both)
-    assert problem.is_task and not problem.with_lines.goal.approaches
+    assert problem.goal.approaches and not with_lines(problem).goal.approaches
     problem.save(tmp_path / "approach.yaml")
     task = plan_task(tmp_path / "approach.yaml", timeout=20.0)
     assert task and [step.title for step in task.steps] == ["goal", "line left_hand"]

@@ -155,6 +155,10 @@ def _use_kinematics() -> None:
         found = planner.ik(pose, near="home", count=4)
         assert isinstance(found, IKResult) and found.states.shape == (4, 7) and len(found) == len(list(found)) == 4
         assert isinstance(found[0], IKSolution) and found[0].clearance > 0.0
+        wanted = pose.model_copy(update={"orientation": (1.0, 0.0, 0.0, 0.0), "approach": (0.0, 0.0, 0.05)})
+        grasps = planner.problem("home", apex_ompl.AnyOf([wanted]))
+        assert grasps.goal.approaches and not wanted.before_approach.approach and wanted.is_exact
+        assert planner.plan_task(grasps, timeout=20.0)
         assert isinstance(planner.prove([home, home]), ProofResult) and planner.checker.is_free(home)
 
 
