@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from apex_ompl.moving.settings import LoopSettings as LoopSettings
     from apex_ompl.paths.path import Path as Path
     from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
+    from apex_ompl.planning.query import AnyOf as AnyOf
     from apex_ompl.planning.task_result import TaskResult as TaskResult
     from apex_ompl.planning.world import World as World
     from apex_ompl.result import PlanResult as PlanResult
@@ -63,6 +64,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "moving.settings": "LoopSettings",
         "paths.path": "Path",
         "planning.planner": "MotionPlanner",
+        "planning.query": "AnyOf",
         "planning.task_result": "TaskResult",
         "planning.world": "World",
         "result": "PlanResult PlanStatus",

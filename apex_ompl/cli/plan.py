@@ -77,7 +77,7 @@ def run(parsed: argparse.Namespace) -> int:
     )  # fmt: skip
     check_arguments(parsed.timeout, parsed.seed)
     problem = load_problem(parsed.problem)
-    result = (plan_task if problem.after and not parsed.to_goal else plan)(
+    result = (plan_task if (problem.after or problem.goal.approaches) and not parsed.to_goal else plan)(
         problem,
         planner=parsed.planner,
         timeout=parsed.timeout,

@@ -13,7 +13,7 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +86,22 @@ class WorkspaceGoal(Protocol):
         """Return the error terms at a state, shape (dof,), all 0 or more."""
 
 
+@runtime_checkable
+class GoalSet(Protocol):
+    """Goals of which any will do, which sample themselves."""
+
+    def sample(
+        self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
+    ) -> GoalSamples:
+        """Sample free states that reach one of the goals."""
+
+    def sample_on(
+        self, constraints: ConstraintSet, checker: CollisionChecker, rng: np.random.Generator, count: int = 8,
+        max_attempts: int = 200,
+    ) -> GoalSamples:  # fmt: skip
+        """Sample free states that reach one of the goals and satisfy constraints."""
+
+
 @dataclass(frozen=True)
 class GoalSamples:
     """States sampled for a goal.
@@ -109,6 +125,8 @@ class GoalSamples:
         """Reason for which there is no state, in one sentence; empty when there is one."""
         if len(self.states):
             return ""
+        if not self.attempts and not self.converged:
+            return "none of the goal states is inside the limits and leaves the joints that are not planned as they are"
         if ON_CONSTRAINTS in self.best:
             return f"no state at the goal on the constraints was found in {self.attempts} attempts"
         if self.converged:
@@ -118,7 +136,11 @@ class GoalSamples:
 
 
 def sample(
-    goal: WorkspaceGoal, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
+    goal: WorkspaceGoal | GoalSet,
+    checker: CollisionChecker,
+    rng: np.random.Generator,
+    count: int = 8,
+    max_attempts: int = 200,
 ) -> GoalSamples:
     """Sample free states that reach a goal: the nearest to the start in time, then others that are apart from them.
 
@@ -129,6 +151,8 @@ def sample(
         count: Most states to return.
         max_attempts: Most descents from random states.
     """
+    if isinstance(goal, GoalSet):
+        return goal.sample(checker, rng, count, max_attempts)
     search = _Search(goal, checker, rng)
     near = others = np.empty((0, checker.robot.dof))
     for _ in range(SEARCHES):
@@ -150,7 +174,7 @@ def sample(
 
 
 def sample_on_constraints(
-    goal: WorkspaceGoal, constraints: ConstraintSet, checker: CollisionChecker, rng: np.random.Generator,
+    goal: WorkspaceGoal | GoalSet, constraints: ConstraintSet, checker: CollisionChecker, rng: np.random.Generator,
     *, known: GoalSamples, count: int = 8, max_attempts: int = 200,
 ) -> GoalSamples:  # fmt: skip
     """Sample free states that reach a goal and satisfy constraints along the path, the nearest to the start first.
@@ -166,6 +190,8 @@ def sample_on_constraints(
         count: Most states to return.
         max_attempts: Most random states.
     """
+    if isinstance(goal, GoalSet):
+        return goal.sample_on(constraints, checker, rng, count, max_attempts)
     search, found, attempts, converged = _Search(goal, checker, rng), list[Array](), 0, 0
     states, blocked = known.states, ""
     while True:

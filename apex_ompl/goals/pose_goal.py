@@ -7,10 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.constraints.frames import frame_of
+from apex_ompl.constraints.frames import Frame, frame_of
 from apex_ompl.constraints.links import Links, in_world
+from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import angle
 from apex_ompl.kernel import Target, offset_target, opposition_target
+from apex_ompl.kernel.products import product
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
 from apex_ompl.scene.problem import PoseTarget
@@ -18,6 +20,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.forking import ProcessLock
 
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
+DRAWN = 24  # poses that stand for a region
 RESIDUAL = 1e-6  # largest residual at which inverse kinematics ends
 
 
@@ -25,7 +28,8 @@ class PoseGoal:
     """Poses that frames of a robot reach together; joints that move none of the frames stay as at the start."""
 
     def __init__(
-        self, robot: Robot, poses: Sequence[PoseTarget], attached: Sequence[AttachedObject], start: Array
+        self, robot: Robot, poses: Sequence[PoseTarget], attached: Sequence[AttachedObject], start: Array,
+        drawn: Sequence[PoseTarget] = (),
     ) -> None:  # fmt: skip
         """Find the frames and prepare inverse kinematics.
 
@@ -34,17 +38,24 @@ class PoseGoal:
             poses: The poses.
             attached: The held objects.
             start: The start, shape (dof,).
+            drawn: Poses inside of the regions of ``poses`` that inverse kinematics is to reach; by default the given
+                ones.
 
         Raises:
             UnknownNameError: A frame is not a hand, a link or a held object.
+            ParameterError: The free turn of a contact face is not about its z axis.
         """
         self.robot = robot
         self.poses = tuple(poses)
         self.start = np.clip(start, robot.limits.lower, robot.limits.upper)  # as plans clip it
         held = {a.name: a for a in attached}
         self.frames = tuple(frame_of(robot, pose.frame, held, "frame of a pose") for pose in self.poses)
+        for pose, frame in zip(self.poses, self.frames, strict=True):
+            if frame.axial and (pose.free_turn not in (None, "z") or pose.turn is not None):
+                raise ParameterError("free_turn", pose.free_turn, f"z and no turn for {pose.frame}, a contact face")
+        self._drawn = tuple(drawn) or self.poses
         self._numbers = [robot.link_frame(frame.link) for frame in self.frames]
-        self._data = robot.model.createData()
+        self._data: pin.Data | None = None  # made when it is needed
         self._lock = ProcessLock()  # of the data
         names = [h.synergy for h in robot.hands.values() if h.synergy is not None]
         hands = np.array([robot.joint_names.index(name) for name in names], dtype=np.intp)
@@ -53,6 +64,7 @@ class PoseGoal:
     def placements(self, q: Array) -> list[Array]:
         """Return the poses of the frames in the world at a state, shape (4, 4) each [m]."""
         with self._lock:
+            self._data = self._data or self.robot.model.createData()
             pin.framesForwardKinematics(self.robot.model, self._data, self.robot.to_pinocchio(np.asarray(q, float)))
             links = [np.array(self._data.oMf[number].homogeneous) for number in self._numbers]
         return [link @ frame.pose for link, frame in zip(links, self.frames, strict=True)]
@@ -61,11 +73,12 @@ class PoseGoal:
         """Return the error terms at a state, shape (dof,): distances [m] and angles [rad]."""
         errors = {}
         for pose, frame, found in zip(self.poses, self.frames, self.placements(q), strict=True):
-            errors[f"position of {pose.frame}"] = float(np.linalg.norm(found[:3, 3] - pose.position))
+            wanted = pose_matrix(pose.position, pose.orientation or (0.0, 0.0, 0.0, 1.0))
+            inside = wanted[:3, :3].T @ (found[:3, 3] - wanted[:3, 3])
+            outside = inside - np.clip(inside, pose.lower, pose.upper)
+            errors[f"position of {pose.frame}"] = float(np.linalg.norm(outside))
             if pose.orientation is not None:
-                wanted = pose_matrix(pose.position, pose.orientation)[:3, :3]
-                turned = angle(found[:3, 2], wanted[:, 2]) if frame.axial else rotation_angle(found[:3, :3], wanted)
-                errors[f"angle of {pose.frame}"] = turned
+                errors[f"angle of {pose.frame}"] = _turned(pose, frame, found[:3, :3], wanted[:3, :3])
         return errors
 
     @property
@@ -80,13 +93,13 @@ class PoseGoal:
     def targets(self) -> list[Target]:
         """Return the residuals of inverse kinematics; distances are weighted by ``POSITION_WEIGHT``."""
         links, targets = Links.of(self.robot), []
-        for pose, frame in zip(self.poses, self.frames, strict=True):
+        for pose, frame in zip(self._drawn, self.frames, strict=True):
             point = links.point(frame.link, frame.pose[:3, 3])
             targets.append(offset_target(in_world(pose.position), point, weight=POSITION_WEIGHT))
             if pose.orientation is None:
                 continue
             wanted = pose_matrix(pose.position, pose.orientation)[:3, :3]
-            for k in (2,) if frame.axial else (0, 2):
+            for k in _axes(pose, frame):
                 axis = links.direction(frame.link, frame.pose[:3, k])
                 targets.append(opposition_target(axis, in_world(wanted[:, k]), -1.0))
         return targets
@@ -95,6 +108,81 @@ class PoseGoal:
         """Return the result of inverse kinematics from a state, shape (dof,); it need not reach the poses."""
         found: Array = self.inverse.descend(np.asarray(q, float), tolerance=RESIDUAL).states[0]
         return found
+
+
+def pose_goals(
+    robot: Robot, poses: Sequence[PoseTarget], attached: Sequence[AttachedObject], start: Array
+) -> list[PoseGoal]:  # fmt: skip
+    """Return the goal of poses; where they are regions, goals of the nearest poses to the start and of drawn ones.
+
+    Args:
+        robot: The robot.
+        poses: The poses.
+        attached: The held objects.
+        start: The start, shape (dof,).
+
+    Raises:
+        UnknownNameError: A frame is not a hand, a link or a held object.
+    """
+    goal = PoseGoal(robot, poses, attached, start)
+    if all(pose.is_exact for pose in poses):
+        return [goal]
+    rng, goals = np.random.default_rng(0), list[PoseGoal]()
+    placed = goal.placements(goal.start)
+    for k in range(DRAWN):
+        drawn = [_drawn(pose, found, rng if k else None) for pose, found in zip(poses, placed, strict=True)]
+        goals.append(PoseGoal(robot, poses, attached, start, drawn))
+    return goals
+
+
+def _drawn(pose: PoseTarget, placed: Array, rng: np.random.Generator | None) -> PoseTarget:
+    """Return a pose drawn from the region of another one, or without ``rng`` the one nearest to where the frame is."""
+    wanted = pose_matrix(pose.position, pose.orientation or (0.0, 0.0, 0.0, 1.0))
+    lower, upper = np.array(pose.lower), np.array(pose.upper)
+    inside = np.clip(product(wanted[:3, :3].T, (placed[:3, 3] - wanted[:3, 3])[:, None])[:, 0], lower, upper)
+    if rng is not None:
+        inside = lower + rng.random(3) * (upper - lower)
+    update: dict[str, object] = {
+        "position": tuple((product(wanted[:3, :3], inside[:, None])[:, 0] + wanted[:3, 3]).tolist()),
+        "lower": (0.0, 0.0, 0.0), "upper": (0.0, 0.0, 0.0),
+    }  # fmt: skip
+    if pose.turn is not None and pose.free_turn is not None:
+        k = "xyz".index(pose.free_turn)
+        by = float(np.clip(_twist(product(wanted[:3, :3].T, placed[:3, :3]), k), *pose.turn))
+        by = by if rng is None else float(rng.uniform(*pose.turn))
+        turned = product(wanted[:3, :3], pin.exp3(by * np.eye(3)[k]))
+        update |= {"orientation": tuple(pin.Quaternion(turned).coeffs().tolist()), "free_turn": None, "turn": None}
+    return pose.model_copy(update=update)
+
+
+def _axes(pose: PoseTarget, frame: Frame) -> tuple[int, ...]:
+    """Return the axes of a frame whose directions are wanted."""
+    if pose.free_turn is not None:
+        return ("xyz".index(pose.free_turn),)
+    return (2,) if frame.axial else (0, 2)
+
+
+def _turned(pose: PoseTarget, frame: Frame, found: Array, wanted: Array) -> float:
+    """Return the angle of an orientation to the wanted ones [rad].
+
+    With a free turn, it is the angle between the axes, or that by which the turn about it is out of range, where that
+    is larger.
+    """
+    if frame.axial or pose.free_turn is not None:
+        (k,) = _axes(pose, frame)
+        off = angle(found[:, k], wanted[:, k])
+        if pose.turn is None or frame.axial:
+            return off
+        by = _twist(wanted.T @ found, k)
+        return max(off, abs(by - float(np.clip(by, *pose.turn))))
+    return rotation_angle(found, wanted)
+
+
+def _twist(rotation: Array, k: int) -> float:
+    """Return the angle of the turn about an axis in a rotation, the rest of which turns the axis itself [rad]."""
+    xyzw = pin.Quaternion(rotation).coeffs()
+    by = 2.0 * float(np.arctan2(xyzw[k], xyzw[3]))
+    return by - 2.0 * np.pi * round(by / (2.0 * np.pi))
 
 
 def rotation_angle(first: Array, second: Array) -> float:

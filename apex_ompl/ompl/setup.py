@@ -14,8 +14,9 @@ from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
+from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample, sample_on_constraints
-from apex_ompl.goals.pose_goal import PoseGoal
+from apex_ompl.goals.pose_goal import PoseGoal, pose_goals
 from apex_ompl.ompl.constrained_space import constraint_of
 from apex_ompl.ompl.simple_setup import SimpleSetup
 from apex_ompl.ompl.space import Bounds, to_state
@@ -270,16 +271,30 @@ def _held_fault(robot: Robot, start: Array, goal: Array, held: NDArray[np.intp])
     return ""
 
 
-def workspace_goal(robot: Robot, problem: Problem) -> AlignmentGoal | PoseGoal | None:
-    """Return the goal of a problem that is given in the workspace, or None where it is joint configurations.
+def workspace_goal(robot: Robot, problem: Problem) -> AlignmentGoal | PoseGoal | AnyGoal | None:
+    """Return the goal of a problem that is sampled, or None where it is joint configurations.
 
     Raises:
         UnknownNameError: A held object, a link or a hand is unknown.
         FileFormatError: An alignment does not fit the held objects.
     """
+    start = problem.start_state(robot.joint_names)
     if problem.goal.poses is not None:
-        return PoseGoal(robot, problem.goal.poses, problem.attached, problem.start_state(robot.joint_names))
-    return alignment_goal(robot, problem)
+        poses = pose_goals(robot, problem.goal.poses, problem.attached, start)
+        return poses[0] if len(poses) == 1 else AnyGoal(robot, poses, np.empty((0, robot.dof)), start)
+    if problem.goal.any_of is None:
+        return alignment_goal(robot, problem)
+    members, states = list[PoseGoal | AlignmentGoal](), [np.empty((0, robot.dof))]
+    for goal in problem.goal.any_of:
+        one = problem.model_copy(update={"goal": goal})
+        found = workspace_goal(robot, one)
+        if isinstance(found, AnyGoal):
+            members += found.members
+        elif found is None:
+            states.append(robot.within_limits(one.goal_states(robot.joint_names)))
+        else:
+            members.append(found)
+    return AnyGoal(robot, members, np.concatenate(states), start)
 
 
 def set_goals(simple_setup: og.SimpleSetup, goals: list[Array]) -> None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apex_ompl.apex.parameters import ApexParameters
-from apex_ompl.goals.goal_sampling import WorkspaceGoal, sample
+from apex_ompl.goals.goal_sampling import GoalSet, WorkspaceGoal, sample
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
 from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, assemble, workspace_goal
@@ -200,7 +200,7 @@ class OtherPaths:
         return None
 
 
-def sampled_goal(setup: PlanningSetup) -> WorkspaceGoal | None:
+def sampled_goal(setup: PlanningSetup) -> WorkspaceGoal | GoalSet | None:
     """Return the goal of a problem that is given in the workspace, for the joints that are planned, or None."""
     robot = setup.robot
     if len(setup.held):

@@ -177,6 +177,8 @@ def _matrix(pose: Any, before: Array, axial: bool, name: str) -> Array:
     """
     made = before.copy()
     if isinstance(pose, PoseTarget):
+        if not pose.is_exact or pose.free_turn is not None:
+            raise ParameterError(name, pose, "one pose, without free_turn, lower and upper")
         made[:3, 3] = pose.position
         if pose.orientation is not None:
             wanted = pose_matrix(pose.position, pose.orientation)[:3, :3]

@@ -10,7 +10,8 @@ import time
 from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
+from math import nan
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
 
 from apex_ompl import planners
@@ -18,14 +19,17 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.util.display import one_line
 from apex_ompl.util.forking import ProcessLock, unforked
 from apex_ompl.util.process import running
-from apex_ompl.util.validation import check_flag, check_number, check_options, check_positive, check_seed
+from apex_ompl.util.validation import check_flag, check_integer, check_number, check_options, check_positive, check_seed
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
     from ompl import geometric as og
 
     from apex_ompl.collision import CollisionChecker, Contact
     from apex_ompl.constraints.user import UserConstraint
+    from apex_ompl.paths.path import Path
     from apex_ompl.planners import AnyPlanner
+    from apex_ompl.planning.inverse_kinematics import IKResult
     from apex_ompl.planning.line_query import Waypoint
     from apex_ompl.planning.lines import LineResult
     from apex_ompl.planning.query import Group, State, Target
@@ -34,8 +38,9 @@ if TYPE_CHECKING:
     from apex_ompl.robot import Robot
     from apex_ompl.scene.bodies import Obstacle
     from apex_ompl.scene.constraints import Constraint
-    from apex_ompl.scene.problem import Problem
-    from apex_ompl.timing import Timing
+    from apex_ompl.scene.problem import PoseTarget, Problem
+    from apex_ompl.timing import Timing, Trajectory
+    from apex_ompl.types import Array
 
 MOST_IDLE = 4  # planners of a robot that are kept
 _Stamps = tuple[int, ...]
@@ -134,6 +139,38 @@ class StateCheck:
         return one_line("StateCheck", found, f"clearance {1e3 * self.clearance:.2f} mm")
 
 
+@dataclass(frozen=True, eq=False)
+class ProofResult:
+    """Outcome of :meth:`MotionPlanner.prove`; true for a path or a motion that is proved.
+
+    Attributes:
+        reason: Why it is not, in one sentence with the place; empty for one that is proved.
+        segment: Number k of the segment between the states k and k + 1 of a path that fails, or None.
+        time: When a motion fails [s], NaN for a path.
+        state: The state that collides, shape (dof,), or None where another fault was found first.
+        clearance: Least distance of a pair of bodies along it [m], NaN where it was not determined.
+        clearance_bound: Proved lower bound of it [m]; 0 without a proof.
+        clearance_pair: The two bodies there; empty where there are none.
+    """
+
+    reason: str
+    segment: int | None
+    time: float
+    state: Array | None
+    clearance: float
+    clearance_bound: float
+    clearance_pair: tuple[str, str]
+
+    def __bool__(self) -> bool:
+        """Whether it is proved."""
+        return not self.reason
+
+    def __repr__(self) -> str:
+        """Return whether it is proved, why it is not, and the clearance."""
+        found = "proved" if self else f"not proved: {self.reason}"
+        return one_line("ProofResult", found, f"clearance {1e3 * self.clearance:.2f} mm")
+
+
 class MotionPlanner:
     """A robot in a world, ready to plan again and again.
 
@@ -148,7 +185,7 @@ class MotionPlanner:
     """
 
     @unforked()
-    def __init__(self, robot: str | Path | Robot = "dual_panda_softhand", model: str | None = None) -> None:
+    def __init__(self, robot: str | FilePath | Robot = "dual_panda_softhand", model: str | None = None) -> None:
         """Make a planner in an empty world.
 
         Args:
@@ -225,6 +262,7 @@ class MotionPlanner:
         check_options(options, OPTIONS)
         with running(), self._lock:
             problem = self.problem(start, goal, name, group, options.get("seed", 0))
+            _check_is_no_line(problem)
             return self._plan(problem, planner, started, PlanOptions(group=group, **options))
 
     def plan_problem(
@@ -242,6 +280,7 @@ class MotionPlanner:
         """
         started = time.perf_counter()
         check_options(options, OPTIONS)
+        _check_is_no_line(problem)
         with running(), self._lock:
             with unforked():
                 self.world.load(problem)
@@ -266,7 +305,9 @@ class MotionPlanner:
         with running(), self._lock:
             with unforked():
                 from apex_ompl.planning.tasks import plan_task
+                from apex_ompl.scene.problem import with_lines
 
+                problem = with_lines(problem)
                 self.world.load(problem)
             given = PlanOptions(**options)
 
@@ -471,6 +512,110 @@ class MotionPlanner:
             checker = self._checker_now()
             return StateCheck(state_fault(checker, q), checker.clearance(q), tuple(checker.contacts(q)))
 
+    def fk(self, state: State, frame: str) -> Array:
+        """Return the pose of a frame in the world at a state, shape (4, 4) [m].
+
+        Args:
+            state: The state.
+            frame: Hand, link or held object, as in a ``PoseTarget``.
+
+        Raises:
+            ParameterError: The state has not the robot's joints.
+            UnknownNameError: There is no such frame.
+        """
+        from apex_ompl.constraints.frames import frame_of
+        from apex_ompl.planning.query import state_array
+
+        q = state_array(self.robot, state, "state")
+        with self._lock:
+            found = frame_of(self.robot, frame, self.world.held, "frame")
+        pose: Array = self.robot.link_pose(q, found.link) @ found.pose
+        return pose
+
+    def ik(
+        self, targets: PoseTarget | Sequence[PoseTarget], *, near: State | None = None, group: Group | None = None,
+        count: int = 256, descents: int = 512, seed: int = 0,
+    ) -> IKResult:  # fmt: skip
+        """Return the free states that reach poses, in the world as it is now.
+
+        A redundant arm reaches a pose along self-motions; there is a state every 0.1 rad of the joint that moves most.
+
+        Args:
+            targets: A pose, or several that are reached together.
+            near: State near which the solutions are wanted: the nearest come first. By default those with the largest
+                clearance come first, by millimeters, then those nearest to home. Joints that move none of the frames
+                stay as there, or as at home.
+            group: Joints that may move, by names of groups and joints; all by default.
+            count: Most solutions.
+            descents: Most descents from random states, for each arm.
+            seed: Seed of the random states.
+
+        Returns:
+            The solutions; where there is none, ``reason`` says why, and ``causes`` what stood in the way.
+
+        Raises:
+            ApexError: A frame or a joint is unknown, or an option is faulty.
+        """
+        import numpy as np
+
+        from apex_ompl.planning.inverse_kinematics import solve
+        from apex_ompl.planning.query import planned_joints, pose_targets, state_array
+
+        check_seed(seed)
+        check_integer(count, "count", 1)
+        check_integer(descents, "descents", 1)
+        poses, limits = pose_targets(targets), self.robot.limits
+        base = self.robot.home if near is None else state_array(self.robot, near, "near")
+        moving = self.robot.joint_names if group is None else planned_joints(self.robot, group)
+        fixed = np.array([k for k, joint in enumerate(self.robot.joint_names) if joint not in moving], np.intp)
+        with running(), self._lock:
+            return solve(
+                self._checker_now(), poses, base.clip(limits.lower, limits.upper), fixed,
+                by_distance=near is not None, count=count, descents=descents, seed=seed,
+            )  # fmt: skip
+
+    def prove(
+        self, path: Sequence[State] | ArrayLike | Path | Trajectory, *,
+        constraints: Sequence[Constraint | UserConstraint] = (),
+    ) -> ProofResult:  # fmt: skip
+        """Prove a path or a motion of your own in the world as it is now: the full check that each plan passes.
+
+        It has to be inside the limits (a motion inside those of velocity, acceleration and jerk, too) and free of
+        collision from end to end, between its states, too.
+
+        Args:
+            path: States that are joined by straight lines, shape (N, dof), or a timed motion of all joints, which is
+                proved along its own cubic pieces.
+            constraints: Constraints along it.
+
+        Raises:
+            ParameterError: It has not the robot's joints, or a number that is not finite.
+            ApexError: A constraint is faulty.
+        """
+        from apex_ompl.planning.user_path import prove
+
+        with running(), self._lock:
+            changing = [obstacle.name for obstacle in self._checker.changing_obstacles if obstacle.moving]
+            if changing:
+                raise ParameterError("world", f"the moving obstacle {changing[0]!r}", "obstacles that stand still")
+            check = prove(self._checker_now(), path, lambda start: self.problem(start, start), constraints)
+        proof = check.proof
+        if proof is None:
+            return ProofResult(check.reason, check.segment, nan, None, nan, 0.0, ("", ""))
+        time = proof.parameter if not check and check.segment is None else nan
+        return ProofResult(
+            check.reason, check.segment, time, None if check else proof.state, proof.clearance, proof.clearance_bound,
+            proof.pair,
+        )  # fmt: skip
+
+    @property
+    def checker(self) -> CollisionChecker:
+        """The collision checker of the world: of states, distances, contacts and paths, for tools of your own.
+
+        It follows edits of the world; ask it while no other thread edits, or in ``with planner.world.locked()``.
+        """
+        return self._checker_now()
+
     def simple_setup(
         self, start: State, goal: Target, *, constraints: Sequence[Constraint | UserConstraint] = ()
     ) -> og.SimpleSetup:
@@ -537,6 +682,16 @@ def _from_rest(options: PlanOptions) -> PlanOptions:
     if not isinstance(timing, bool):
         timing = replace(timing, start_velocity=(), start_acceleration=(), minimum_duration=0.0)
     return replace(options, timing=timing, leave_contact=0.0, constraints=())
+
+
+def _check_is_no_line(problem: Problem) -> None:
+    """Check that a goal has no approach.
+
+    Raises:
+        ParameterError: It has one.
+    """
+    for frame, approach in problem.goal.approaches.items():
+        raise ParameterError("goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task")
 
 
 def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:

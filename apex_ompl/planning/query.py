@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -16,8 +17,9 @@ from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_name, finite_array
 
-State = Mapping[str, float] | ArrayLike
-"""A state: values by joint name, or all of them in the robot's order, shape (dof,) [rad; synergies 0..1]."""
+State = str | Mapping[str, float] | ArrayLike
+"""A state: the name of one of the robot's poses, values by joint name, or all of them in the robot's order, shape
+(dof,) [rad; synergies 0..1]."""
 
 GOAL_STATES, GOAL_ATTEMPTS = 8, 200  # states that are taken of a user's sampler, and draws for them
 
@@ -30,12 +32,24 @@ class GoalSampler(Protocol):
         """Return a state that reaches the goal, shape (dof,), or None where this draw finds none."""
 
 
+@dataclass(frozen=True)
+class AnyOf:
+    """Goals of which any will do, such as hundreds of grasps; which one, the motion to it decides.
+
+    Attributes:
+        goals: The goals: states, by name, joint or in order, poses, lists of poses that are reached together,
+            alignments, or goals of problems.
+    """
+
+    goals: Sequence[Any]
+
+
 Group = str | Sequence[str]
 """Joints that a plan moves: name of a group of the robot, or names of groups and joints."""
 
-Target = State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal | GoalSampler
+Target = State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal | AnyOf | GoalSampler
 """A goal: a state, several of which any will do, shape (goals, dof), poses of one frame or more, an alignment of held
-objects, the goal of a problem, or an object that draws states."""
+objects, the goal of a problem, any of several goals, or an object that draws states."""
 
 
 def joint_values(robot: Robot, state: State, name: str) -> dict[str, float]:
@@ -48,7 +62,10 @@ def joint_values(robot: Robot, state: State, name: str) -> dict[str, float]:
 
     Raises:
         ParameterError: It has not the robot's shape, or a number that is not finite.
+        UnknownNameError: The robot has no pose of that name.
     """
+    if isinstance(state, str):
+        state = robot.poses[check_name(state, f"pose of {robot.name} as {name}", robot.poses)]
     if isinstance(state, Mapping):
         given = {str(joint): finite_array(value, f"{name}.{joint}") for joint, value in state.items()}
         for joint, value in given.items():
@@ -77,6 +94,19 @@ def state_array(robot: Robot, state: State, name: str) -> Array:
     return np.array([values[joint] for joint in robot.joint_names])
 
 
+def pose_targets(targets: PoseTarget | Sequence[PoseTarget]) -> tuple[PoseTarget, ...]:
+    """Return one pose or several as a tuple.
+
+    Raises:
+        ParameterError: They are no poses, or there is none.
+        FileFormatError: Two poses are given for one frame.
+    """
+    several = (targets,) if isinstance(targets, PoseTarget) else targets
+    if not isinstance(several, Sequence) or not several or not all(isinstance(one, PoseTarget) for one in several):
+        raise ParameterError("targets", targets, "a PoseTarget, or several")
+    return validate(Goal, {"poses": tuple(several)}, "targets").poses or ()
+
+
 def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal:
     """Return a goal as the record of a problem.
 
@@ -91,6 +121,11 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
     """
     if isinstance(target, Goal):
         return target
+    if isinstance(target, AnyOf):
+        if isinstance(target.goals, str | Mapping) or not isinstance(target.goals, Iterable):
+            raise ParameterError("goal", target.goals, "several goals in AnyOf")
+        records = [goal_record(robot, one, held) for one in target.goals]
+        return validate(Goal, {"any_of": tuple(records)}, "goal")
     if isinstance(target, Alignment):
         return Goal(alignment=target)
     if isinstance(target, PoseTarget):
@@ -131,9 +166,9 @@ def sampled_goals(
 
 
 def _several(target: Any) -> Sequence[Any]:
-    if isinstance(target, Mapping):
+    if isinstance(target, str | Mapping):
         return [target]
-    if isinstance(target, Sequence) and target and isinstance(target[0], Mapping):
+    if isinstance(target, Sequence) and target and any(isinstance(one, str | Mapping) for one in target):
         return target
     values = finite_array(target, "goal")
     return list(np.atleast_2d(values)) if values.size else []

@@ -99,8 +99,7 @@ class TaskWorld:
             q: The state, shape (dof,).
         """
         start = dict(zip(self.robot.joint_names, q.tolist(), strict=True))
-        if goal.joints is not None:
-            goal = Goal(joints=tuple(start | dict(values) for values in goal.joints))
+        goal = goal.with_joints(start)
         return given.model_copy(
             update={
                 "scene": tuple(self.scene.values()), "attached": tuple(self.held.values()),

@@ -17,6 +17,7 @@ from apex_ompl.util.files import is_file
 from apex_ompl.util.schema import StrictModel, check_version, read_yaml, validate
 
 SCHEMA = "apex-ompl/robot/1"
+HOME = "home"  # name of the pose that the homes of the joints are
 PAIRS_SCHEMA = "apex-ompl/disabled-pairs/1"
 
 
@@ -99,6 +100,7 @@ class RobotConfig(StrictModel):
         locked: Joint name -> value of joints that become fixed joints.
         groups: Named groups of planned joints.
         hands: Hands by name.
+        poses: Named states: joint name -> value; joints that one leaves out are at home. ``home`` is there already.
         disabled_pairs: File of further link pairs that are not checked for collision.
         covers: File of sphere covers of the links; without it coarser covers are made at run time.
         packages: Package name -> its folder, for ``package://NAME/...``; relative to the robot file.
@@ -113,6 +115,7 @@ class RobotConfig(StrictModel):
     locked: dict[str, float] = {}
     groups: dict[str, tuple[str, ...]] = {}
     hands: dict[str, Hand] = {}
+    poses: dict[Name, dict[str, float]] = {}
     disabled_pairs: str | None = None
     covers: str | None = None
     packages: dict[str, str] = {}
@@ -127,6 +130,12 @@ class RobotConfig(StrictModel):
             for name in names:
                 if name not in self.joints:
                     raise ValueError(f"group {group!r} names the unknown joint {name!r}")
+        for pose, values in self.poses.items():
+            for name in values:
+                if name not in self.joints:
+                    raise ValueError(f"pose {pose!r} names the unknown joint {name!r}")
+        if HOME in self.poses:
+            raise ValueError(f"expected {HOME!r} as the home of each joint and not among the poses")
         for hand, record in self.hands.items():
             if record.synergy is not None and record.synergy not in self.joints:
                 raise ValueError(f"hand {hand!r} names the unknown joint {record.synergy!r}")

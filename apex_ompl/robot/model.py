@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.compose import compose
-from apex_ompl.robot.config import DATA, WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs, resolve
+from apex_ompl.robot.config import DATA, HOME, WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs, resolve
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array
@@ -111,6 +111,7 @@ class Robot:
         limits: Limits in state order.
         effort: Largest torques or forces that the robot file gives, shape (dof,) [Nm, N]; infinite where it gives none.
         home: A collision-free resting state, shape (dof,).
+        poses: Name -> state, shape (dof,): ``home``, and the poses of the robot file.
         groups: Group name -> indices into a state.
         hands: Hand name -> palm, grasp point and synergy.
         model: Pinocchio model; the order of its q differs from that of states, see :meth:`to_pinocchio`.
@@ -127,6 +128,7 @@ class Robot:
     limits: Limits
     effort: Array
     home: Array
+    poses: Mapping[str, Array]
     groups: Mapping[str, NDArray[np.intp]]
     hands: Mapping[str, Hand]
     model: pin.Model
@@ -361,13 +363,28 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         name = names[int(np.argmax(outside))]
         field_name, value = f"joints.{name}.home", config.joints[name].home
         raise FileFormatError(str(path), field_name, value, "expected a value inside the limits")
-    for array in (effort, home, *vars(limits).values(), *groups.values(), order):
+    poses = {HOME: home, **{pose: _posed(config, limits, pose, path) for pose in config.poses}}
+    for array in (effort, *poses.values(), *vars(limits).values(), *groups.values(), order):
         array.flags.writeable = False
     return Robot(
-        name=config.name, joint_names=names, limits=limits, effort=effort, home=home, groups=groups,
-        hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures, part_links=composition.part_links,
-        urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
+        name=config.name, joint_names=names, limits=limits, effort=effort, home=home, poses=poses, groups=groups,
+        hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures,
+        part_links=composition.part_links, urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
     )  # fmt: skip
+
+
+def _posed(config: RobotConfig, limits: Limits, pose: str, path: Path) -> Array:
+    """Return a named pose as a state, shape (dof,).
+
+    Raises:
+        FileFormatError: A value is outside the limits.
+    """
+    values = config.poses[pose]
+    q = np.array([values.get(name, joint.home) for name, joint in config.joints.items()])
+    for k, name in enumerate(config.joints):
+        if not limits.lower[k] <= q[k] <= limits.upper[k]:
+            raise FileFormatError(str(path), f"poses.{pose}.{name}", q[k], "expected a value inside the limits")
+    return q
 
 
 def _state_order(config: RobotConfig, model: pin.Model, path: Path) -> NDArray[np.intp]:

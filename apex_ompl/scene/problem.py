@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
 
-from apex_ompl.errors import FileFormatError, nearest_name
-from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located
+from apex_ompl.errors import FileFormatError, ParameterError, nearest_name
+from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located, pose_matrix
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
 from apex_ompl.scene.steps import (
     GraspStep,
@@ -36,7 +36,7 @@ from apex_ompl.util.schema import StrictModel, check_version, dump_yaml, read_ya
 SCHEMA = "apex-ompl/problem/1"
 
 
-GOALS = ("joints", "alignment", "poses")
+GOALS = ("joints", "alignment", "poses", "any_of")
 """Kinds of goals."""
 
 JointValues = dict[str, float]
@@ -113,24 +113,68 @@ class Alignment(StrictModel):
 class PoseTarget(StrictModel):
     """A pose in the world that a frame of the robot is to reach.
 
+    With ``free_turn``, ``lower`` and ``upper`` it is a region of poses, by the axes of the wanted pose.
+
     Attributes:
         frame: Name of a hand, whose frame is that of its palm with the grasp point as origin; of a link; or of a held
             object, whose frame is its own, or its contact face with the outward axis as z where it has one.
         position: Position of the frame's origin [m].
         orientation: Orientation of the frame, a quaternion xyzw; any by default. Of a contact face its z axis counts.
         tolerance: How far from it counts as reached.
+        free_turn: Axis of the frame about which it may be turned.
+        turn: Least and largest angle by which it may be turned about that axis [rad]; by default any.
+        lower: Least position of the frame's origin relative to ``position``, along the axes of the wanted pose [m].
+        upper: Largest one.
+        approach: Displacement along the frame's own axes by which it goes to the pose, straight, without turning [m].
     """
 
     frame: Name
     position: Vector
     orientation: Quaternion | None = None
     tolerance: PoseTolerance = PoseTolerance()
+    free_turn: Literal["x", "y", "z"] | None = None
+    turn: tuple[float, float] | None = None
+    lower: Vector = (0.0, 0.0, 0.0)
+    upper: Vector = (0.0, 0.0, 0.0)
+    approach: Vector | None = None
+
+    @model_validator(mode="after")
+    def _a_region(self) -> Self:
+        if self.free_turn is not None and self.orientation is None:
+            raise ValueError("expected an orientation beside free_turn")
+        if self.turn is not None and (self.free_turn is None or not -np.pi <= self.turn[0] <= self.turn[1] <= np.pi):
+            raise ValueError("expected turn: [least, largest] inside [-3.1416, 3.1416] beside a free_turn")
+        if not all(low <= 0.0 <= high for low, high in zip(self.lower, self.upper, strict=True)):
+            raise ValueError("expected a lower of 0 or less and an upper of 0 or more")
+        if self.approach is not None and (self.orientation is None or max(map(abs, self.approach)) < 1e-6):
+            raise ValueError("expected an approach that is not zero, beside an orientation")
+        if self.approach is not None and self.free_turn is not None:
+            along = ["xyz"[k] for k in range(3) if self.approach[k]]
+            if along != [self.free_turn]:
+                raise ValueError(f"expected an approach along the axis of the free turn, {self.free_turn}")
+        return self
+
+    @property
+    def before_approach(self) -> PoseTarget:
+        """The pose where the approach starts, without one."""
+        if self.approach is None:
+            return self
+        wanted = pose_matrix(self.position, self.orientation or (0.0, 0.0, 0.0, 1.0))
+        by = [sum(wanted[i, k] * self.approach[k] for k in range(3)) for i in range(3)]
+        position = tuple(float(self.position[i] - by[i]) for i in range(3))
+        return self.model_copy(update={"position": position, "approach": None})
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it is one pose but for a free turn, and no region of positions or angles."""
+        return self.turn is None and not any(self.lower) and not any(self.upper)
 
 
 class Goal(StrictModel):
-    """A goal: joint configurations of which one is to be reached, an alignment of held objects, or poses.
+    """A goal: joint configurations of which one is to be reached, an alignment of held objects, poses, or several.
 
     Poses are reached all at once, by one frame each; joints that move none of the frames stay as they are at the start.
+    Of the goals in ``any_of``, any will do.
     """
 
     joints: (
@@ -143,6 +187,7 @@ class Goal(StrictModel):
     ) = None
     alignment: Alignment | None = None
     poses: Annotated[tuple[PoseTarget, ...], Field(min_length=1)] | None = None
+    any_of: Annotated[tuple[Goal, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
@@ -153,7 +198,36 @@ class Goal(StrictModel):
         twice = sorted({name for name in frames if frames.count(name) > 1})
         if twice:
             raise ValueError(f"more than one pose is given for {twice[0]!r}")
+        if any(one.any_of is not None for one in self.any_of or ()):
+            raise ValueError("expected no any_of inside of any_of")
         return self
+
+    @property
+    def approaches(self) -> dict[str, Vector]:
+        """Frames that go straight to their poses -> displacement along their own axes [m].
+
+        Raises:
+            ParameterError: The goals in ``any_of`` have different ones.
+        """
+        each = [one.approaches for one in self.any_of or ()]
+        each = each or [{pose.frame: pose.approach for pose in self.poses or () if pose.approach is not None}]
+        if any(one != each[0] for one in each):
+            raise ParameterError("approach", each, "the same frames and approaches in all goals of any_of")
+        return each[0]
+
+    @property
+    def before_approach(self) -> Goal:
+        """The goal with the poses where approaches start, and without these."""
+        if self.any_of is not None:
+            return self.model_copy(update={"any_of": tuple(one.before_approach for one in self.any_of)})
+        poses = None if self.poses is None else tuple(pose.before_approach for pose in self.poses)
+        return self.model_copy(update={"poses": poses})
+
+    def with_joints(self, values: Mapping[str, float]) -> Goal:
+        """Return the goal with values of joints that its joint configurations leave out."""
+        if self.any_of is not None:
+            return Goal(any_of=tuple(one.with_joints(values) for one in self.any_of))
+        return self if self.joints is None else Goal(joints=tuple({**values, **given} for given in self.joints))
 
 
 class MoveStep(Step):
@@ -169,6 +243,8 @@ class MoveStep(Step):
     @property
     def subject(self) -> str:
         """What is moved, or the kind of goal."""
+        if self.goal.any_of is not None:
+            return counted(len(self.goal.any_of), "goal")
         if self.goal.poses is not None:
             return " and ".join(pose.frame for pose in self.goal.poses)
         if self.goal.alignment is None:
@@ -333,6 +409,35 @@ class Problem(StrictModel):
         if self.robot.endswith((".yaml", ".yml")):
             update["robot"] = os.path.normpath(folder / self.robot)
         return self.model_copy(update=update)
+
+
+def with_lines(problem: Problem) -> Problem:
+    """Return a problem with a step ``line`` in place of each approach.
+
+    Raises:
+        ParameterError: The goals in an ``any_of`` have different approaches.
+    """
+    steps = [step for given in problem.after for step in _with_lines(given)]
+    goal, *lines = _with_lines(MoveStep(goal=problem.goal))
+    assert isinstance(goal, MoveStep)
+    return problem.model_copy(update={"goal": goal.goal, "after": (*lines, *steps)})
+
+
+def _with_lines(step: AnyStep) -> list[AnyStep]:
+    """Return a step, and for each approach of its goal a line after it.
+
+    Frames with the same approach go in step.
+    """
+    if not isinstance(step, MoveStep):
+        return [step]
+    approaches = step.goal.approaches
+    if not approaches:
+        return [step]
+    frames = dict[Vector, list[str]]()
+    for frame, by in approaches.items():
+        frames.setdefault(by, []).append(frame)
+    lines = [LineStep(frame=tuple(names), by=by, axes="frame") for by, names in frames.items()]
+    return [step.model_copy(update={"goal": step.goal.before_approach}), *lines]
 
 
 def _in_order(values: Mapping[str, float], joint_names: Sequence[str], source: str, field: str) -> Array:

@@ -31,6 +31,7 @@ def run(root: Path) -> list[str]:
     made: set[type] = set()
     with _traced(called, made):
         _use_planner()
+        _use_kinematics()
         _use_tasks()
         _use_records()
         _use_trajectories()
@@ -141,6 +142,24 @@ def _use_planner() -> None:
         planner.plan(home, home, timeout=-1.0)
     except apex_ompl.ApexError as error:
         assert "timeout" in str(error)
+
+
+def _use_kinematics() -> None:
+    """Inverse and forward kinematics, and paths of a user's own."""
+    import apex_ompl
+    from apex_ompl.planning import IKResult, IKSolution, ProofResult
+
+    with apex_ompl.MotionPlanner("panda") as planner:
+        home = planner.robot.home
+        pose = apex_ompl.PoseTarget(frame="hand", position=tuple(planner.fk("home", "hand")[:3, 3]))
+        found = planner.ik(pose, near="home", count=4)
+        assert isinstance(found, IKResult) and found.states.shape == (4, 7) and len(found) == len(list(found)) == 4
+        assert isinstance(found[0], IKSolution) and found[0].clearance > 0.0
+        wanted = pose.model_copy(update={"orientation": (1.0, 0.0, 0.0, 0.0), "approach": (0.0, 0.0, 0.05)})
+        grasps = planner.problem("home", apex_ompl.AnyOf([wanted]))
+        assert grasps.goal.approaches and not wanted.before_approach.approach and wanted.is_exact
+        assert planner.plan_task(grasps, timeout=20.0)
+        assert isinstance(planner.prove([home, home]), ProofResult) and planner.checker.is_free(home)
 
 
 def _use_tasks() -> None:

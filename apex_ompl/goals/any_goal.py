@@ -1,0 +1,165 @@
+"""Goals of which any will do: poses, such as grasps of an object, alignments and joint configurations.
+
+A few descents of inverse kinematics for each goal find those that can be reached soon. These are then sampled as a goal
+alone is (:mod:`apex_ompl.goals.goal_sampling`), and the states that are nearest in time are returned. A pose with a
+region is a goal of this kind as well: poses that are drawn in the region.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.goals import goal_sampling as single
+from apex_ompl.goals.alignment import AlignmentGoal, within
+from apex_ompl.goals.goal_sampling import GoalSamples
+from apex_ompl.goals.pose_goal import PoseGoal
+from apex_ompl.robot import Robot
+from apex_ompl.robot.rest_to_rest import direct_durations
+from apex_ompl.types import Array
+
+if TYPE_CHECKING:
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+
+ANY = "goal"  # error term: 0 where a goal is reached, else the least error relative to the bounds
+DESCENTS = 1024  # of the first search, for all goals together, within the numbers for each
+LEAST_DESCENTS, MOST_DESCENTS = 4, 32  # for each
+EXAMINED = 4  # goals that are sampled in full: those with the nearest free states
+UNTRIED = 12  # the same where the first search found no free state
+SHARE = 2  # states that are returned, as a multiple of those for a goal alone
+
+
+class _First(NamedTuple):
+    """Outcome of the first search.
+
+    Attributes:
+        states: Free states, shape (N, dof).
+        order: Numbers of the goals to be sampled in full.
+        attempts: Number of descents.
+        converged: Number of those that reached a goal.
+        blocked: A collision of a joint configuration; empty where one is free.
+    """
+
+    states: Array
+    order: list[int]
+    attempts: int
+    converged: int
+    blocked: str
+
+
+class AnyGoal:
+    """Goals of which any will do."""
+
+    def __init__(self, robot: Robot, members: Sequence[PoseGoal | AlignmentGoal], states: Array, start: Array) -> None:
+        """Take goals in the workspace, and joint configurations.
+
+        Args:
+            robot: The robot.
+            members: The goals in the workspace.
+            states: The joint configurations, shape (N, dof).
+            start: The start, shape (dof,).
+        """
+        self.robot, self.members = robot, tuple(members)
+        self.states = states[((states >= robot.limits.lower) & (states <= robot.limits.upper)).all(axis=1)]
+        self.start = np.clip(start, robot.limits.lower, robot.limits.upper)
+
+    @property
+    def bounds(self) -> Mapping[str, float]:
+        """Tolerance of the error term."""
+        return {ANY: 0.0}
+
+    def errors(self, q: Array) -> Mapping[str, float]:
+        """Return 0 where a goal is reached at a state, shape (dof,), else the least error relative to the bounds."""
+        reached = bool((np.abs(self.states - q).max(axis=1, initial=0.0) <= single.TOLERANCE).any())
+        least = 0.0 if reached else np.inf
+        for goal in self.members:
+            if not least:
+                break
+            errors, bounds = goal.errors(q), goal.bounds
+            least = 0.0 if within(errors, bounds) else min(least, single.relative_error(errors, bounds))
+        return {ANY: least}
+
+    def sample(
+        self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
+    ) -> GoalSamples:
+        """Sample free states that reach a goal, the nearest to the start in time first.
+
+        Args:
+            checker: Checks the states for collision.
+            rng: Source of random numbers.
+            count: States to return of a goal alone; at most twice as many are returned.
+            max_attempts: Most descents from random states for each goal that is sampled in full.
+        """
+        first = self._first(checker, rng)
+        found = [single.sample(self.members[k], checker, rng, count, max_attempts) for k in first.order]
+        states = np.concatenate([first.states, *(one.states for one in found)])
+        states = self._nearest(states, SHARE * count)
+        attempts = first.attempts + sum(one.attempts for one in found)
+        converged = first.converged + sum(one.converged for one in found)
+        if len(states):
+            return GoalSamples(states, attempts, converged, {}, "")
+        blocked = next((one.blocked for one in found if one.blocked), first.blocked)
+        best = min((one.best for one in found), key=lambda best: max(best.values()), default={})
+        return GoalSamples(states, attempts, converged, best, blocked)
+
+    def sample_on(
+        self, constraints: ConstraintSet, checker: CollisionChecker, rng: np.random.Generator, count: int = 8,
+        max_attempts: int = 200,
+    ) -> GoalSamples:  # fmt: skip
+        """Sample free states that reach a goal and satisfy constraints along the path, as :meth:`sample` does."""
+        first = self._first(checker, rng)
+        found = list[GoalSamples]()
+        for k in first.order:
+            known = single.sample(self.members[k], checker, rng, count, max_attempts)
+            found.append(
+                single.sample_on_constraints(
+                    self.members[k], constraints, checker, rng, known=known, count=count, max_attempts=max_attempts
+                )
+            )
+        kept = self.states[[checker.is_free(q) and constraints.is_satisfied(q) for q in self.states]]
+        states = self._nearest(np.concatenate([kept, *(one.states for one in found)]), SHARE * count)
+        attempts = first.attempts + sum(one.attempts for one in found)
+        return GoalSamples(states, attempts, len(states), {} if len(states) else {single.ON_CONSTRAINTS: np.inf}, "")
+
+    def _first(self, checker: CollisionChecker, rng: np.random.Generator) -> _First:
+        """Return free states by a few descents for each goal, and the goals to be sampled in full."""
+        least = np.full(len(self.members), np.inf)  # duration to the nearest free state of each goal [s]
+        reached = np.zeros(len(self.members), bool)
+        states, attempts, converged, blocked = [self.states], 0, len(self.states), ""
+        each = int(np.clip(DESCENTS // max(len(self.members), 1), LEAST_DESCENTS, MOST_DESCENTS))
+        for k, goal in enumerate(self.members):
+            seeds = np.tile(self.start, (each, 1))
+            noise = rng.normal(size=(each, len(goal.inverse.free)))
+            seeds[:, goal.inverse.free] += np.linspace(0.0, single.FARTHEST, each)[:, None] * noise
+            ends = goal.inverse.descend(
+                seeds.clip(self.robot.limits.lower, self.robot.limits.upper),
+                tolerance=single.TOLERANCE, max_steps=single.DESCENT_STEPS,
+            )  # fmt: skip
+            attempts += each
+            there = ends.states[ends.errors <= 10.0 * single.TOLERANCE]
+            converged += len(there)
+            reached[k] = len(there) > 0
+            free = there[checker.are_free(there)] if len(there) else there
+            if len(free):
+                least[k] = float(self._durations(free).min())
+                states.append(free)
+        free = self.states[[checker.is_free(q) for q in self.states]]
+        if len(self.states) and not len(free):
+            blocked = str(next(iter(checker.contacts(self.states[0])), "in collision"))
+        order = np.lexsort([least, ~reached])[: EXAMINED if np.isfinite(least).any() else UNTRIED]
+        return _First(np.concatenate([free, *states[1:]]), order.tolist(), attempts, converged, blocked)
+
+    def _durations(self, states: Array) -> Array:
+        return direct_durations(self.start, states, self.robot.limits)
+
+    def _nearest(self, states: Array, count: int) -> Array:
+        """Return the states that are nearest in time and apart from each other, shape (N, dof)."""
+        kept = list[Array]()
+        for k in np.argsort(self._durations(states), kind="stable"):
+            apart = single.NEAR if len(kept) < single.NEAREST else single.APART
+            if len(kept) < count and all(np.abs(q - states[k]).max() >= apart for q in kept):
+                kept.append(states[k])
+        return np.array(kept).reshape(-1, self.robot.dof)

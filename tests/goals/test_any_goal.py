@@ -1,0 +1,237 @@
+"""Goals of which any will do, and poses with free turns, boxes and ranges of angles, against Pinocchio and SciPy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from apex_ompl import AnyOf, ApexError, MotionPlanner, PlanStatus, PoseTarget, Problem, Robot, plan, plan_task
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.goals.any_goal import AnyGoal
+from apex_ompl.goals.goal_sampling import sample
+from apex_ompl.goals.pose_goal import PoseGoal, pose_goals
+from apex_ompl.loop.referee import is_at_goal
+from apex_ompl.ompl.setup import workspace_goal
+from apex_ompl.robot.rest_to_rest import direct_durations
+from apex_ompl.scene import OnPlane
+from apex_ompl.scene.constraints import PoseTolerance
+from apex_ompl.scene.problem import with_lines
+
+
+def hand_pose(robot: Robot, q: np.ndarray, hand: str = "left_hand") -> pin.SE3:
+    """The pose of a hand, by Pinocchio alone."""
+    data, record = robot.model.createData(), robot.hands[hand]
+    pin.framesForwardKinematics(robot.model, data, robot.to_pinocchio(q))
+    return data.oMf[robot.model.getFrameId(record.palm)] * pin.SE3(np.eye(3), np.array(record.point))
+
+
+def target(pose: pin.SE3, **fields: Any) -> PoseTarget:
+    xyzw = tuple(pin.Quaternion(pose.rotation).coeffs())
+    return PoseTarget(frame="left_hand", position=tuple(pose.translation), orientation=xyzw, **fields)
+
+
+def wanted_pose(pose: PoseTarget) -> pin.SE3:
+    return pin.SE3(pin.Quaternion(np.array(pose.orientation)), np.array(pose.position))
+
+
+def near_home(robot: Robot, seed: int, count: int, spread: float = 0.3) -> list[PoseTarget]:
+    rng = np.random.default_rng(seed)
+    states = robot.home + rng.normal(0.0, spread, (count, robot.dof))
+    return [target(hand_pose(robot, q)) for q in states.clip(robot.limits.lower, robot.limits.upper)]
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_nearest_of_many_poses_is_about_as_near_as_the_best_of_them_alone(robot: Robot, seed: int) -> None:
+    poses, checker = near_home(robot, seed, 12), CollisionChecker(robot)
+    goals = [PoseGoal(robot, [pose], (), robot.home) for pose in poses]
+    together = AnyGoal(robot, goals, np.empty((0, robot.dof)), robot.home)
+    found = sample(together, checker, np.random.default_rng(0)).states
+    assert 0 < len(found) <= 16 and checker.are_free(found).all()
+    for q in found:  # each reaches one of the poses
+        off = [pin.log6(wanted_pose(pose).actInv(hand_pose(robot, q))) for pose in poses]
+        assert min(np.abs(one.vector).max() for one in off) < 1e-3
+        assert together.errors(q) == {"goal": 0.0}
+    assert together.errors(robot.home)["goal"] > 0.0
+    alone = [sample(goal, checker, np.random.default_rng(0)).states for goal in goals]
+    best = min(direct_durations(robot.home, one, robot.limits).min() for one in alone if len(one))
+    assert direct_durations(robot.home, found, robot.limits).min() < 1.2 * best
+
+
+def test_poses_and_joint_configurations_are_mixed(robot: Robot, tmp_path: Path) -> None:
+    near, far = robot.home.copy(), robot.home.copy()
+    near[0] += 0.5
+    far[0] -= 1.3
+    pose = near_home(robot, 5, 1, 0.5)[0]
+    with MotionPlanner(robot) as planner:
+        planner.world.add(name="ball", sphere={"radius": 0.02}, position=(0.5, 0.0, 1.2))
+        result = planner.plan("home", AnyOf([far, pose, near]), timeout=20.0)
+        assert result and np.array_equal(result.path.states[-1], near)
+        problem = planner.problem("home", AnyOf([far, pose, near]))
+        blocked = robot.link_pose(near, "left_hand_palm")[:3, 3]
+        planner.world.move("ball", tuple(blocked))
+        other = planner.plan("home", AnyOf([far, pose, near]), timeout=20.0, group="left_arm")
+        assert other and not np.array_equal(other.path.states[-1], near)
+        assert np.array_equal(other.path.states[-1][7:], robot.home[7:])
+        refused = planner.plan("home", AnyOf([near]), timeout=20.0)
+        assert refused.status is PlanStatus.INVALID_GOAL and "ball" in refused.reason
+        outside = near.copy()
+        outside[8] += 0.3
+        refused = planner.plan("home", AnyOf([outside]), timeout=20.0, group="left_arm")
+        assert refused.status is PlanStatus.INVALID_GOAL and "not planned" in refused.reason
+    problem.save(tmp_path / "any.yaml")
+    again = Problem.load(tmp_path / "any.yaml")
+    assert again == problem and [*again.as_dict()["goal"]] == ["any_of"]
+    assert is_at_goal(robot, again, near) and is_at_goal(robot, again, far) and not is_at_goal(robot, again, robot.home)
+    read = plan(tmp_path / "any.yaml", timeout=20.0)
+    assert read and np.array_equal(read.path.states[-1], near)
+
+
+def test_constraints_hold_at_the_goal_that_is_chosen(robot: Robot) -> None:
+    pose = hand_pose(robot, robot.home)
+    up, aside = pose.copy(), pose.copy()
+    up.translation[2] += 0.1
+    aside.translation[0] += 0.05
+    plane = OnPlane(frame="left_hand", normal=(1.0, 0.0, 0.0))
+    with MotionPlanner(robot) as planner:
+        result = planner.plan("home", AnyOf([target(aside), target(up)]), timeout=20.0, constraints=[plane])
+    assert result and np.allclose(hand_pose(robot, result.path.states[-1]).translation, up.translation, atol=2e-3)
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_a_frame_with_a_free_turn_is_turned_about_that_axis_alone(robot: Robot, axis: str) -> None:
+    k, checker = "xyz".index(axis), CollisionChecker(robot)
+    wanted = hand_pose(robot, robot.home + 0.1 * np.sin(np.arange(robot.dof)))
+    goal = PoseGoal(robot, [target(wanted, free_turn=axis)], (), robot.home)
+    found = sample(goal, checker, np.random.default_rng(0)).states
+    turns = list[float]()
+    for q in found:
+        off = wanted.actInv(hand_pose(robot, q))
+        vector = Rotation.from_matrix(off.rotation).as_rotvec()
+        turns.append(vector[k])
+        assert np.linalg.norm(off.translation) < 1e-3 and np.abs(np.delete(vector, k)).max() < 1e-2
+    assert len(found) > 1 and np.ptp(turns) > 0.01
+
+
+def test_a_box_and_a_range_of_angles_bound_the_pose_in_its_own_frame(robot: Robot) -> None:
+    wanted = hand_pose(robot, robot.home + 0.1 * np.sin(np.arange(robot.dof)))
+    region = target(
+        wanted, lower=(-0.05, 0.0, -0.02), upper=(0.05, 0.0, 0.1), free_turn="z", turn=(-0.3, 0.2),
+        tolerance=PoseTolerance(position=1e-3, angle=1e-2),
+    )  # fmt: skip
+    members = pose_goals(robot, [region], (), robot.home)
+    goal = AnyGoal(robot, members, np.empty((0, robot.dof)), robot.home)
+    found = sample(goal, CollisionChecker(robot), np.random.default_rng(0)).states
+    low, high = np.array(region.lower) - 1e-3, np.array(region.upper) + 1e-3
+    assert len(found) > 4
+    for q in found:
+        off = wanted.actInv(hand_pose(robot, q))
+        assert (off.translation >= low).all() and (off.translation <= high).all()
+        x, y, turn = Rotation.from_matrix(off.rotation).as_rotvec()
+        assert abs(x) < 1e-2 and abs(y) < 1e-2 and -0.31 <= turn <= 0.21
+    for by, turn, error in (((0.0, 0.0, 0.0), 0.1, 0.0), ((0.07, 0.0, 0.0), 0.0, 0.02), ((0.0, 0.0, 0.0), 0.5, 0.3)):
+        moved = wanted * pin.SE3(pin.exp3(np.array([0.0, 0.0, turn])), np.array(by))
+        q = PoseGoal(robot, [target(moved)], (), robot.home).nearest(robot.home)
+        assert max(members[0].errors(q).values()) == pytest.approx(error, abs=1e-5)
+
+
+def test_a_region_near_the_start_needs_a_shorter_motion_than_its_middle(robot: Robot) -> None:
+    away = hand_pose(robot, robot.home)
+    away.translation[:] += (0.1, 0.0, -0.1)
+    size = 0.09
+    with MotionPlanner(robot) as planner:
+        one = planner.plan("home", target(away), timeout=20.0)
+        region = planner.plan("home", target(away, lower=(-size,) * 3, upper=(size,) * 3), timeout=20.0)
+    assert one and region and region.trajectory.duration < one.trajectory.duration
+
+
+def test_goals_that_all_fail_say_so_in_a_sentence(robot: Robot) -> None:
+    far = [PoseTarget(frame="left_hand", position=(3.0 + k, 0.0, 0.5)) for k in range(3)]
+    with MotionPlanner(robot) as planner:
+        refused = planner.plan("home", AnyOf(far), timeout=5.0)
+    assert refused.status is PlanStatus.INVALID_GOAL and "not reached in" in refused.reason
+    assert "position of left_hand" in refused.reason
+
+
+@pytest.mark.parametrize(
+    ("goal", "message"),
+    [
+        (lambda: AnyOf([]), "any_of"),
+        (lambda: AnyOf("home"), "several goals"),
+        (lambda: AnyOf(3), "several goals"),
+        (lambda: AnyOf([AnyOf(["home"])]), "no any_of inside"),
+        (lambda: AnyOf([PoseTarget(frame="hnd", position=(0.5, 0.0, 0.5))]), "unknown frame of a pose 'hnd'"),
+        (lambda: AnyOf(["hme"]), "unknown pose"),
+        (lambda: AnyOf([[1.0, 2.0]]), "goal: expected a state of shape"),
+        (lambda: {"left_joint1": 0.1}, "joint .* is missing"),
+        (lambda: AnyOf([{"left_joint1": 0.1}]), "joint .* is missing"),
+    ],
+)
+def test_faulty_goals_are_named(robot: Robot, goal: Any, message: str) -> None:
+    with MotionPlanner(robot) as planner, pytest.raises(ApexError, match=message):
+        planner.plan("home", goal())
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"free_turn": "z"}, "an orientation beside free_turn"),
+        ({"turn": (0.0, 1.0)}, "beside a free_turn"),
+        ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (1.0, 0.0)}, "least, largest"),
+        ({"lower": (0.1, 0.0, 0.0)}, "a lower of 0 or less"),
+        ({"approach": (0.0, 0.0, 0.1)}, "beside an orientation"),
+        ({"orientation": (0, 0, 0, 1), "approach": (0.0, 0.0, 0.0)}, "an approach that is not zero"),
+        ({"orientation": (0, 0, 0, 1), "free_turn": "x", "approach": (0, 0, 0.1)}, "along the axis of the free turn"),
+        ({"orientation": (0, 0, 0, 1), "free_turn": "w"}, "'x', 'y' or 'z'"),
+    ],
+)
+def test_faulty_regions_are_named(robot: Robot, fields: dict[str, Any], message: str) -> None:
+    goal = {"poses": [{"frame": "left_hand", "position": (0.5, 0.0, 0.5), **fields}]}
+    start = dict(zip(robot.joint_names, robot.home.tolist(), strict=True))
+    with pytest.raises(ApexError, match=message):
+        Problem.parse({"name": "faulty", "robot": robot.name, "start": start, "goal": goal}, "faulty")
+
+
+def test_a_line_goes_to_one_pose(robot: Robot) -> None:
+    with MotionPlanner(robot) as planner, pytest.raises(ApexError, match="without free_turn"):
+        planner.plan_line("home", target(hand_pose(robot, robot.home), free_turn="z"))
+
+
+def test_a_region_of_a_problem_is_any_of_the_drawn_poses(robot: Robot) -> None:
+    with MotionPlanner(robot) as planner:
+        problem = planner.problem("home", target(hand_pose(robot, robot.home), upper=(0.1, 0.0, 0.0)))
+    goal = workspace_goal(robot, problem)
+    assert isinstance(goal, AnyGoal) and len(goal.members) > 1 and goal.errors(robot.home) == {"goal": 0.0}
+
+
+def test_an_approach_ends_straight_along_an_axis_of_the_hand(robot: Robot, tmp_path: Path) -> None:
+    at = hand_pose(robot, robot.home + 0.1 * np.sin(np.arange(robot.dof)))
+    lower = at.copy()
+    lower.translation[2] -= 0.03
+    by = np.array([0.0, 0.05, 0.0])
+    goals = AnyOf([target(at, approach=tuple(by)), target(lower, approach=tuple(by))])
+    with MotionPlanner(robot) as planner:
+        problem = planner.problem("home", goals)
+        with pytest.raises(ApexError, match="a plan by plan_task"):
+            planner.plan("home", goals)
+        with pytest.raises(ApexError, match="a plan by plan_task"):
+            planner.plan_problem(problem)
+        both = planner.problem("home", AnyOf([target(at, approach=tuple(by)), target(lower)]))
+        with pytest.raises(ApexError, match="the same frames and approaches"):
+            planner.plan_task(both)
+    assert problem.goal.approaches and not with_lines(problem).goal.approaches
+    problem.save(tmp_path / "approach.yaml")
+    task = plan_task(tmp_path / "approach.yaml", timeout=20.0)
+    assert task and [step.title for step in task.steps] == ["goal", "line left_hand"]
+    line = task.steps[-1].path.states
+    ends = [hand_pose(robot, q) for q in (line[0], line[-1])]
+    offs = [min(np.abs(pin.log6(pose.actInv(ends[1])).vector).max() for pose in (at, lower))]
+    assert offs[0] < 2e-3
+    assert np.allclose(ends[0].actInv(ends[1]).translation, by, atol=1e-3)
+    for q in line:
+        off = ends[0].actInv(hand_pose(robot, q))
+        assert np.linalg.norm(np.delete(off.translation, 1)) < 3e-4 and np.linalg.norm(pin.log3(off.rotation)) < 3e-3
