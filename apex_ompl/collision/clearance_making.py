@@ -1,8 +1,8 @@
 """Makes the tables of clearances of a robot's links, see :mod:`apex_ompl.collision.clearance_tables`.
 
-A table is a grid of cells over the values of one or two joints. Where the exact shapes are not proved apart over a whole
-cell (:mod:`apex_ompl.kernel.compiled.check.box_bound`), it is halved along each axis. Tables are made for pairs that
-the sphere covers leave open at some states, those that are open most often first.
+A table is a grid of cells over the values of one to three joints. Where the exact shapes are not proved apart over a
+whole cell (:mod:`apex_ompl.kernel.compiled.check.box_bound`), it is halved along each axis. Tables are made for pairs
+that the sphere covers leave open at some states, those that are open most often first, and those of three joints last.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.products import product
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.robot import Robot
+from apex_ompl.types import Array
 
 ROUNDING = 1e-9  # by which cells are widened [rad], [m]
-FIRST, LAST = 3, (10, 7)  # levels: 2^n cells along each axis at first, and at last for one joint and for two
+FIRST, LAST = 3, (10, 7, 6)  # levels: 2^n cells along each axis at first, and at last by the number of joints
+SHARE = 1 / 3  # of the time that is left, for one table
 SAFE = 1e-6  # by which bounds are lowered [m]
 ENOUGH = 5e-4  # bound with which a cell is not divided further [m]
 SAMPLES = 500  # states at which the covers are tried
@@ -89,7 +91,9 @@ class TableMaker:
         )
         self._radii, self._bounds = arrays.ball[:, 3], BoxBounds(self._kernel, pack(arrays))
         near, shares = near_pairs(robot, tree, self._solids, stage.body_pairs), self._open_shares()
-        self.pairs = sorted((p for p in near if p.links in shares), key=lambda p: (-shares[p.links], p.links))
+        self.pairs = sorted(
+            (p for p in near if p.links in shares), key=lambda p: (len(p.sources) // 3, -shares[p.links], p.links)
+        )
         self.shares = [shares[pair.links] for pair in self.pairs]
 
     def names(self, pair: NearPair) -> tuple[str, str]:
@@ -105,9 +109,13 @@ class TableMaker:
         counted = Counter((min(pair), max(pair)) for pair in ((numbers[a], numbers[b]) for a, b in found.tolist()))
         return {pair: count / SAMPLES for pair, count in counted.items()}
 
+    def bounds(self, pair: NearPair, middles: Array, half: Array, *, least: float, need: float) -> Array:
+        """Return :meth:`apex_ompl.kernel.box_bound.BoxBounds.over` of two links, the smaller of which moves."""
+        first, second = sorted((self._row[k] for k in pair.links), key=lambda row: self._radii[row])
+        return self._bounds.over(first, second, middles, half, least=least, need=need)
+
     def make(self, pair: NearPair, seconds: float) -> tuple[Cells, bool]:
         """Return the cells of a pair's table, and whether the CPU time sufficed [s]; cells are unproved where not."""
-        first, second = sorted((self._row[k] for k in pair.links), key=lambda row: self._radii[row])
         lower, upper = table_range(self._robot, pair)
         axes, start = list(pair.sources), time.process_time()
         last = LAST[len(axes) - 1]
@@ -127,9 +135,7 @@ class TableMaker:
                     return cells, False
                 middles = np.repeat(middle[None], len(some), axis=0)
                 middles[:, axes] = lower + (some + 0.5) * width
-                bounds = self._bounds.over(
-                    first, second, middles, half, least=enough + SAFE, need=(LARGEST + 1) * UNIT + SAFE
-                )
+                bounds = self.bounds(pair, middles, half, least=enough + SAFE, need=(LARGEST + 1) * UNIT + SAFE)
                 proved = bounds >= enough + SAFE
                 at = tuple(some[proved].T)
                 cells[at] = np.minimum((bounds[proved] - SAFE) / UNIT, LARGEST)
@@ -154,7 +160,7 @@ def make_clearances(
 
     Args:
         robot: The robot; tables that it has are not used.
-        seconds: CPU time for all of them [s]; pairs that are open by covers most often come first.
+        seconds: CPU time for all of them [s]; see above.
         progress: Called with what was found for each table.
         known: Tables that were made before, which are kept.
 
@@ -168,8 +174,8 @@ def make_clearances(
         began = time.process_time()
         if pair.key in found or began - start > seconds:
             continue
-        cells, complete = maker.make(pair, seconds - (began - start))
-        if complete:
+        cells, complete = maker.make(pair, SHARE * (seconds - (began - start)))
+        if cells.any():
             found[pair.key] = cells
         if progress is not None:
             table, took = table_of(robot, pair, cells), time.process_time() - began

@@ -1,9 +1,10 @@
-"""Tables of clearances between links that are at most two joints apart, made once for a robot.
+"""Tables of clearances between links that are at most three joints apart, made once for a robot.
 
-The relative pose of two links depends on the planned joints between them. Where these are one or two, the set of joint
-values at which the links are apart can be tabulated. The tables are in a file beside the robot's own, and are named by
-digests of all that they depend on: both shapes, the joints between them and their limits. Arms of the same kind share
-their tables, and a table of another robot is never used. :mod:`apex_ompl.collision.clearance_making` makes them.
+The relative pose of two links depends on the planned joints between them. Where these are one to three, the set of
+joint values at which the links are apart can be tabulated. The tables are in a file beside the robot's own, and are
+named by digests of all that they depend on: both shapes, the joints between them and their limits. Arms of the same
+kind share their tables, and a table of another robot is never used. :mod:`apex_ompl.collision.clearance_making` makes
+them.
 """
 
 from __future__ import annotations
@@ -30,13 +31,14 @@ from apex_ompl.util.files import is_file, pack_archive, read_archive, write_atom
 
 SCHEMA = "apex-ompl/clearance-tables/1"
 SUFFIX = ".clearances.npz"
+MOST_JOINTS = 3  # between the links of a pair
 BEYOND = 2e-3  # by which tables go beyond the limits [rad], [m]
 Cells = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
 class NearPair:
-    """Two links whose relative pose depends on one or two planned joints.
+    """Two links whose relative pose depends on one to three planned joints.
 
     Attributes:
         links: Their places among the robot's geometries.
@@ -52,7 +54,7 @@ class NearPair:
 def near_pairs(
     robot: Robot, tree: JointTree, solids: Sequence[Solid], pairs: Iterable[tuple[int, int]]
 ) -> list[NearPair]:
-    """Return those of some pairs of links whose relative pose depends on one or two planned joints.
+    """Return those of some pairs of links whose relative pose depends on one to three planned joints.
 
     Args:
         robot: The robot.
@@ -66,7 +68,7 @@ def near_pairs(
         sides = [[j for j in chain if j not in other] for chain, other in (chains, chains[::-1])]
         moving = [j for side in sides for j in side if tree.joints[j].kind != FIXED]
         sources = tuple(dict.fromkeys(tree.joints[j].source for j in moving))
-        if not 1 <= len(sources) <= 2:
+        if not 1 <= len(sources) <= MOST_JOINTS:
             continue
         digest = hashlib.sha256(json.dumps([SCHEMA, BEYOND]).encode())
         for k, side in zip((a, b), sides, strict=True):
@@ -101,8 +103,9 @@ def read_clearances(path: Path) -> dict[str, Cells]:
         raise FileFormatError(str(path), "schema", about.get("schema"), f"expected {SCHEMA!r}")
     for key, cells in arrays.items():
         n = len(cells) if cells.ndim else 0
-        if cells.dtype != np.uint8 or cells.shape not in ((n,), (n, n)) or n < 1 or n & (n - 1):
-            expected = "expected bytes of shape (n,) or (n, n), n a power of two"
+        cubic = 1 <= cells.ndim <= MOST_JOINTS and cells.shape == (n,) * cells.ndim
+        if cells.dtype != np.uint8 or not cubic or n < 1 or n & (n - 1):
+            expected = "expected bytes of shape (n,), (n, n) or (n, n, n), n a power of two"
             raise FileFormatError(str(path), key, f"{cells.dtype} {cells.shape}", expected)
     return arrays
 
@@ -123,7 +126,7 @@ def table_of(robot: Robot, pair: NearPair, cells: Cells) -> ClearanceTable:
 
 
 def table_range(robot: Robot, pair: NearPair) -> tuple[Array, Array]:
-    """Return the lowest and highest values of the joints in a pair's table, shape (1,) or (2,) each."""
+    """Return the lowest and highest values of the joints in a pair's table, shape (1,) to (3,) each."""
     chosen = list(pair.sources)
     return robot.limits.lower[chosen] - BEYOND, robot.limits.upper[chosen] + BEYOND
 

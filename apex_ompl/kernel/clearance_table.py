@@ -1,4 +1,4 @@
-"""Tables of clearances of two bodies over the values of one or two joints, as arrays of the kernel."""
+"""Tables of clearances of two bodies over the values of one to three joints, as arrays of the kernel."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from apex_ompl.types import Array
 
 __all__ = ["LARGEST", "UNIT", "ClearanceTable", "table_arrays"]
 
+NO_AXES = ((0.0, 0.0), (0.0, 0.0))
+
 
 @dataclass(frozen=True, eq=False)
 class ClearanceTable:
-    """Lower bounds of the distance of two bodies whose relative pose depends on one or two planned joints.
+    """Lower bounds of the distance of two bodies whose relative pose depends on one to three planned joints.
 
     Attributes:
         joints: Names of the joints.
-        lower: Lowest value of each, shape (1,) or (2,) [rad], [m].
+        lower: Lowest value of each, shape (1,) to (3,) [rad], [m].
         upper: Highest value of each.
-        cells: Lower bounds in units of UNIT over cells of equal size, shape (n,) or (n, n), n a power of two; 0 where
-            the bodies are not proved apart.
+        cells: Lower bounds in units of UNIT over cells of equal size, n a power of two along each axis; 0 where the
+            bodies are not proved apart.
     """
 
     joints: tuple[str, ...]
@@ -65,15 +67,15 @@ def table_arrays(tables: Sequence[ClearanceTable | None], joint_names: Sequence[
         rows.append(len(cells))
         dofs = [joint_names.index(name) for name in table.joints]
         per_unit = len(table.cells) / (table.upper - table.lower)
-        joints.append((dofs + [-1])[:2])
-        ranges.append([*zip(table.lower, per_unit, strict=True), (0.0, 0.0)][:2])
+        joints.append((dofs + [-1, -1])[:3])
+        ranges.append([*zip(table.lower, per_unit, strict=True), *NO_AXES][:3])
         cells.append((size, len(table.cells)))
         levels = [level.ravel() for level in table.levels()]
         content += levels
         size += sum(map(len, levels))
     packed = np.concatenate([*content, np.zeros(-size % 8, np.uint8)])
     return {
-        "bodies_table": np.array(rows, np.int64), "table_joints": np.array(joints, np.int64).reshape(-1, 2),
-        "table_cells": np.array(cells, np.int64).reshape(-1, 2), "table_range": np.array(ranges).reshape(-1, 2, 2),
+        "bodies_table": np.array(rows, np.int64), "table_joints": np.array(joints, np.int64).reshape(-1, 3),
+        "table_cells": np.array(cells, np.int64).reshape(-1, 2), "table_range": np.array(ranges).reshape(-1, 3, 2),
         "table_bytes": packed.view("<i8").astype(np.int64),
     }  # fmt: skip

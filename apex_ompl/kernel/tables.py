@@ -370,8 +370,8 @@ def _as_whole(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         "cluster_range": np.zeros((len(clusters), 2)), "part_lazy": stored["cluster_lazy"],
         "part_bodies": stored["cluster_bodies"], "part_ball": np.repeat(ball[:, None], BINS, axis=1),
         "part_outer": np.repeat(outer[:, None], BINS, axis=1),
-        "bodies_table": np.full(len(stored["bodies"]), -1, np.int64), "table_joints": np.empty((0, 2), np.int64),
-        "table_cells": np.empty((0, 2), np.int64), "table_range": np.empty((0, 2, 2)),
+        "bodies_table": np.full(len(stored["bodies"]), -1, np.int64), "table_joints": np.empty((0, 3), np.int64),
+        "table_cells": np.empty((0, 2), np.int64), "table_range": np.empty((0, 3, 2)),
         "table_bytes": np.empty(0, np.int64),
     }  # fmt: skip
 

@@ -55,7 +55,7 @@ class RobotArrays(NamedTuple):
     of the others, the first pair, and their number.
 
     ``bodies_table`` is the clearance table of each of ``bodies``, or -1, see
-    :mod:`apex_ompl.kernel.compiled.check.clearance_table`. ``table_joints`` are the one or two planned joints that it
+    :mod:`apex_ompl.kernel.compiled.check.clearance_table`. ``table_joints`` are the one to three planned joints that it
     depends on (else -1), ``table_cells`` its first byte and number of cells along each axis, ``table_range`` for each
     joint the lowest value and cells per unit, ``table_bytes`` eight bytes in each number.
     """
@@ -104,9 +104,9 @@ class RobotArrays(NamedTuple):
     pair_parts: Pairs
     run_pairs: Annotated[Integers, 4]
     bodies_table: Integers
-    table_joints: Pairs
+    table_joints: Annotated[Integers, 3]
     table_cells: Pairs
-    table_range: Annotated[Floats, 2, 2]
+    table_range: Annotated[Floats, 3, 2]
     table_bytes: Integers
 
 

@@ -260,15 +260,10 @@ def box_bounds(
 ) -> None:  # fmt: skip
     """Put lower bounds of the distance of two bodies over boxes of states into ``bounds`` (N,) [m].
 
-    Robot and shapes come packed, then the buffers of a state, a pair and a box.
-
-    Args:
-        a: The moving body.
-        b: The other body.
-        middles: Middles of the boxes, shape (N, dof).
-        half: Half widths of all boxes, shape (dof,).
-        least: Bounds that are not larger may be minus infinity [m].
-        need: Bounds that are larger may be too small, but not below this [m].
+    Robot and shapes come packed, then the buffers of a state, a pair and a box. Body ``a`` moves as seen from body
+    ``b``. The boxes have their middles in ``middles``, shape (N, dof), and all the same half widths, shape (dof,).
+    Bounds that are not larger than ``least`` may be minus infinity; those above ``need`` may be smaller, but not below
+    it.
     """
     t, h = robot_view(ri, rf), shapes_view(hi, hf)
     w, g, x = workspace_view(t, wi, wf), pair_view(gi, gf, ()), _box_view(xi, xf, ())
