@@ -11,12 +11,22 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.collision.clearance_tables import Cells, NearPair, near_pairs, table_of, table_range
+from apex_ompl.collision.clearance_tables import (
+    Cells,
+    NearPair,
+    clearance_file,
+    near_pairs,
+    read_clearances,
+    table_of,
+    table_range,
+    write_clearances,
+)
 from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.tables import joint_tree, make_tables
@@ -28,6 +38,7 @@ from apex_ompl.kernel.products import product
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
+from apex_ompl.util.files import check_writable, is_file
 
 ROUNDING = 1e-9  # by which cells are widened [rad], [m]
 FIRST, LAST = 3, (10, 7, 6)  # levels: 2^n cells along each axis at first, and at last by the number of joints
@@ -181,3 +192,28 @@ def make_clearances(
             table, took = table_of(robot, pair, cells), time.process_time() - began
             progress(TableReport(maker.names(pair), table.joints, share, table.proved, len(cells), took, complete))
     return found
+
+
+def prepare_clearances(
+    robot: Robot, seconds: float = 60.0, progress: Callable[[TableReport], None] | None = None
+) -> Path:  # fmt: skip
+    """Make the tables that a robot's file lacks, and write them; return the file.
+
+    Tables of other robots, or of this one before it was changed, are removed from it.
+
+    Args:
+        robot: The robot.
+        seconds: CPU time [s], see :func:`make_clearances`.
+        progress: See :func:`make_clearances`.
+
+    Raises:
+        MissingFileError: The robot's covers cannot be read, or the folder of the file cannot be written.
+        FileFormatError: One of these files does not follow its schema.
+        RobotError: The kernel does not support the motion of a joint.
+    """
+    path = clearance_file(robot)
+    check_writable(path)
+    keys = {pair.key for pair in TableMaker(robot).pairs}
+    known = {key: cells for key, cells in (read_clearances(path) if is_file(path) else {}).items() if key in keys}
+    write_clearances(path, make_clearances(robot, seconds, progress, known))
+    return path

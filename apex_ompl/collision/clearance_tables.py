@@ -160,5 +160,8 @@ def clearances_of(
 
 
 def keep_clearances(robot: Robot, cells: Mapping[str, Cells]) -> None:
-    """Use these tables for a robot instead of those in its file; kernels that were made before stay as they are."""
+    """Use these tables for a robot instead of those in its file; checkers that were made before stay as they are.
+
+    New ones use them from :func:`apex_ompl.collision.conservative.forget_tables` on.
+    """
     _cells_in_file.keep(robot, dict(cells))

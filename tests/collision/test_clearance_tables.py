@@ -12,11 +12,12 @@ from near_links import write_arm
 
 from apex_ompl import load_robot
 from apex_ompl.collision import CollisionChecker, clearance_tables, conservative
-from apex_ompl.collision.clearance_making import TableMaker, TableReport, make_clearances
+from apex_ompl.collision.clearance_making import TableMaker, TableReport, make_clearances, prepare_clearances
 from apex_ompl.collision.clearance_tables import clearance_file, near_pairs, read_clearances, table_of, write_clearances
 from apex_ompl.collision.solids import transform
 from apex_ompl.collision.tables import joint_tree
 from apex_ompl.errors import FileFormatError
+from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.clearance_table import UNIT
 from apex_ompl.robot import Robot
 
@@ -28,8 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("bare", "tabled"):
         (folder / name).mkdir()
         write_arm(folder / name)
-    robot = load_robot(str(folder / "tabled" / "near_links.robot.yaml"))
-    write_clearances(clearance_file(robot), make_clearances(robot, known={}))
+    assert prepare_clearances(robot_of(folder, "tabled")) == folder / "tabled" / "near_links.clearances.npz"
     return folder
 
 
@@ -151,13 +151,19 @@ def test_tables_prove_states_that_the_covers_leave_open(bare: Robot, tabled: Rob
     assert shares[1] > 0.97
 
 
-def test_clearances_of_the_kernel_stay_below_the_distances(tabled: Robot) -> None:
-    checker, states = CollisionChecker(tabled), tabled.random_state(np.random.default_rng(4), 200)
-    own = checker.kernel.clearance(states)[:, 1]
+def test_clearances_of_the_kernel_stay_below_the_distances(bare: Robot, tabled: Robot) -> None:
+    states, positive = tabled.random_state(np.random.default_rng(4), 200), []
     pairs = [(pair.first, pair.second) for pair in tabled.geometry.collisionPairs]
+    pairs = [pair for pair in pairs if names_of(tabled, pair) != ("base", "column")]  # their covers meet, always
     true = np.array([min(distance(tabled, pair, q) for pair in pairs) for q in states])
-    assert (own <= np.maximum(true, 0.0) + 1e-9)[own > 0.0].all()
-    assert (own > 0.0).sum() > 50
+    for robot in (bare, tabled):
+        kernel = CollisionChecker(robot).kernel
+        apart = Kernel(kernel.robot.without_pair("base", "column"), kernel.scene)
+        own, gradient = (values[:, 1] for values in apart.clearance_gradient(states))
+        assert (own <= np.maximum(true, 0.0) + 1e-9)[own > 0.0].all()
+        assert np.isfinite(gradient).all()
+        positive.append(int((own > 0.0).sum()))
+    assert positive[0] + 10 < positive[1]
 
 
 def test_proofs_of_paths_find_the_same_clearance(bare: Robot, tabled: Robot) -> None:
@@ -202,6 +208,21 @@ def test_a_budget_of_no_time_makes_no_tables_and_reports_tell_what_was_found(bar
     assert not again
 
 
+def test_a_file_gets_what_it_lacks_and_loses_what_is_of_another_robot(tmp_path: Path) -> None:
+    robot, reports = load_robot(str(write_arm(tmp_path))), list[TableReport]()
+    whole = make_clearances(robot)
+    gone = next(iter(whole))
+    path = clearance_file(robot)
+    write_clearances(
+        path, {key: cells for key, cells in whole.items() if key != gone} | {"other": np.zeros(8, np.uint8)}
+    )
+    assert prepare_clearances(robot, progress=reports.append) == path
+    assert len(reports) == 1
+    found = read_clearances(path)
+    assert found.keys() == whole.keys()
+    assert all((found[key] == whole[key]).all() for key in whole)
+
+
 @pytest.mark.parametrize("cells", [np.zeros(3, np.uint8), np.zeros(4), np.zeros((4, 2), np.uint8), np.uint8(1)])
 def test_files_with_other_content_are_refused(tmp_path: Path, cells: np.ndarray) -> None:
     path = tmp_path / "a.clearances.npz"
@@ -211,6 +232,6 @@ def test_files_with_other_content_are_refused(tmp_path: Path, cells: np.ndarray)
 
 
 def test_the_robot_of_the_tables_is_planned_for_with_them(tabled: Robot) -> None:
-    conservative._robots.pop(tabled, None)
+    conservative.forget_tables(tabled)
     arrays = CollisionChecker(tabled).kernel.robot.arrays
     assert (arrays.bodies_table >= 0).sum() == len(arrays.table_cells) >= 3
