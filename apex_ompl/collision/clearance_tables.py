@@ -14,6 +14,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,17 +147,31 @@ def clearance_keys(robot: Robot) -> dict[str, str]:
     return {key: hashlib.sha256(cells.tobytes()).hexdigest() for key, cells in _cells_in_file(robot).items()}
 
 
+_tables: WeakKeyDictionary[Robot, dict[tuple[int, int], ClearanceTable]] = WeakKeyDictionary()
+
+
 def clearances_of(
     robot: Robot, tree: JointTree, solids: Sequence[Solid], pairs: Iterable[tuple[int, int]]
 ) -> dict[tuple[int, int], ClearanceTable]:
-    """Return the tables of a robot's file that hold for some pairs of links or held objects; none without a file.
+    """Return the tables of a robot's file that hold for some pairs of its links; none without a file.
+
+    Args:
+        robot: The robot.
+        tree: Its joints.
+        solids: Its links, and held objects after them.
+        pairs: Pairs of these.
 
     Raises:
         FileFormatError: The file does not follow its schema.
     """
     cells = _cells_in_file(robot)
-    near = near_pairs(robot, tree, solids, pairs) if cells else []
-    return {pair.links: table_of(robot, pair, cells[pair.key]) for pair in near if pair.key in cells}
+    if not cells:
+        return {}
+    if robot not in _tables:
+        near = near_pairs(robot, tree, solids, ((pair.first, pair.second) for pair in robot.geometry.collisionPairs))
+        _tables[robot] = {pair.links: table_of(robot, pair, cells[pair.key]) for pair in near if pair.key in cells}
+    known = _tables[robot]
+    return {pair: known[pair] for pair in pairs if pair in known}
 
 
 def keep_clearances(robot: Robot, cells: Mapping[str, Cells]) -> None:
@@ -165,3 +180,4 @@ def keep_clearances(robot: Robot, cells: Mapping[str, Cells]) -> None:
     New ones use them from :func:`apex_ompl.collision.conservative.forget_tables` on.
     """
     _cells_in_file.keep(robot, dict(cells))
+    _tables.pop(robot, None)

@@ -58,7 +58,10 @@ def table_arrays(tables: Sequence[ClearanceTable | None], joint_names: Sequence[
         tables: The table of each pair, None for one without.
         joint_names: Planned joints in state order, among them those of the tables.
     """
-    rows, joints, cells, ranges = [], [], [], []
+    rows: list[int] = []
+    joints: list[list[int]] = []
+    cells: list[tuple[int, int]] = []
+    ranges: list[list[tuple[float, float]]] = []
     content, size = [np.empty(0, np.uint8)], 0
     for table in tables:
         if table is None:
