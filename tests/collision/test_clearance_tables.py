@@ -158,7 +158,7 @@ def test_clearances_of_the_kernel_stay_below_the_distances(bare: Robot, tabled: 
     true = np.array([min(distance(tabled, pair, q) for pair in pairs) for q in states])
     for robot in (bare, tabled):
         kernel = CollisionChecker(robot).kernel
-        apart = Kernel(kernel.robot.without_pair("base", "column"), kernel.scene)
+        apart = Kernel(kernel.robot.without_pair("base_0", "column_0"), kernel.scene)
         own, gradient = (values[:, 1] for values in apart.clearance_gradient(states))
         assert (own <= np.maximum(true, 0.0) + 1e-9)[own > 0.0].all()
         assert np.isfinite(gradient).all()
