@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -266,3 +267,22 @@ def _size(shape: coal.CollisionGeometry) -> tuple[float, ...]:
     if kind == SPHERE:
         return (shape.radius, 0.0, 0.0)
     return (shape.radius, shape.halfLength, 0.0) if kind in (CYLINDER, CAPSULE) else (0.0, 0.0, 0.0)
+
+
+def shape_digest(geometry: coal.CollisionGeometry) -> bytes:
+    """Return the key of a shape, which is of rounded numbers, and a digest of its content to the last bit."""
+    return shape_key(geometry).encode() + _content(geometry)
+
+
+@weakly_cached
+def _content(geometry: coal.CollisionGeometry) -> bytes:
+    digest = hashlib.sha256()
+    if is_shell(geometry):
+        for array in triangles(geometry):
+            digest.update(array.tobytes())
+    elif geometry.getNodeType() == coal.GEOM_CONVEX:
+        digest.update(np.array(geometry.points()).tobytes())
+    cloud = cloud_of(geometry)
+    if cloud is not None:
+        digest.update(cloud.points.tobytes() + repr(cloud.radius).encode())
+    return digest.digest()

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,13 +19,13 @@ import coal
 import numpy as np
 import pinocchio as pin
 
+from apex_ompl.collision.clearance_tables import clearance_keys, clearances_of
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.quick import bounding_boxes, covers_of
-from apex_ompl.collision.cover.spheres import shape_key
-from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays
+from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays, shape_digest
 from apex_ompl.collision.inner_balls import inner_balls
-from apex_ompl.collision.shapes import cloud_of, is_shell, is_surface
+from apex_ompl.collision.shapes import cloud_of, is_surface
 from apex_ompl.collision.solids import Solid
 from apex_ompl.errors import RobotError
 from apex_ompl.kernel.arrays import (
@@ -42,6 +42,7 @@ from apex_ompl.kernel.arrays import (
     pack,
     unpack,
 )
+from apex_ompl.kernel.clearance_table import ClearanceTable
 from apex_ompl.kernel.distance_grid import grid_of_points, grid_of_triangles
 from apex_ompl.kernel.joint_tree import JointTree
 from apex_ompl.kernel.robot_builder import robot_tables
@@ -119,6 +120,7 @@ def tabulate(
     covers: Sequence[Cover],
     meets_scene: Sequence[bool],
     pairs: Iterable[tuple[int, int]],
+    clearances: Mapping[tuple[int, int], ClearanceTable] | None = None,
 ) -> RobotTables:
     """Return the tables of a robot with its links and held objects.
 
@@ -129,6 +131,7 @@ def tabulate(
         covers: The cover of each.
         meets_scene: Whether each is checked against obstacles.
         pairs: Pairs that are checked for self-collision, by their places in ``solids``.
+        clearances: Tables of clearances of some of them.
     """
     bodies = [
         BodySpec(
@@ -140,7 +143,7 @@ def tabulate(
     limits = robot.limits
     return robot_tables(
         robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, tree=joint_tree(robot),
-        bodies=bodies, pairs=list(pairs), numbers=numbers,
+        bodies=bodies, pairs=list(pairs), numbers=numbers, clearances=clearances,
     )  # fmt: skip
 
 
@@ -193,13 +196,14 @@ def make_tables(
 
     Raises:
         MissingFileError: The robot names a file of covers that cannot be read.
-        FileFormatError: That file does not follow its schema.
+        FileFormatError: That file, or that of clearance tables, does not follow its schema.
         RobotError: The kernel does not support the motion of a joint.
     """
     covers = covers_of(robot, [solid.shape for solid in solids])
     return tabulate(
-        robot, solids=solids, numbers=range(len(solids)), covers=covers, meets_scene=meets_scene, pairs=pairs
-    )
+        robot, solids=solids, numbers=range(len(solids)), covers=covers, meets_scene=meets_scene, pairs=pairs,
+        clearances=clearances_of(robot, joint_tree(robot), solids, pairs),
+    )  # fmt: skip
 
 
 def stored_tables(
@@ -209,13 +213,14 @@ def stored_tables(
 
     Raises:
         MissingFileError: The robot names a file of covers that cannot be read.
-        FileFormatError: That file does not follow its schema.
+        FileFormatError: That file, or that of clearance tables, does not follow its schema.
         RobotError: The kernel does not support the motion of a joint.
     """
     limits = robot.limits
     parts = [
         robot.urdf.encode(), robot.to_pinocchio(np.arange(float(robot.dof))).tobytes(), limits.lower.tobytes(),
         limits.upper.tobytes(), b"" if robot.covers is None else read_file(robot.covers, "sphere covers"),
+        json.dumps(sorted(clearance_keys(robot))).encode(),
         *(_of_shape(s.shape, s.joint, s.placement.homogeneous, s.part or s.name) for s in solids),
         repr((robot.name, robot.joint_names, list(meets_scene), list(pairs))).encode(),
     ]  # fmt: skip
@@ -256,22 +261,7 @@ def _stored(
 def _of_shape(geometry: coal.CollisionGeometry, joint: int, pose: Any, name: str = "") -> bytes:
     """Return the content of a shape that is fixed to a joint at a pose, shape (4, 4) [m], that tables depend on."""
     place = np.asarray(pose, float).tobytes()
-    return json.dumps([name, joint, shape_key(geometry)]).encode() + _content(geometry) + place
-
-
-@weakly_cached
-def _content(geometry: coal.CollisionGeometry) -> bytes:
-    """Return a digest of a shape to the last bit; its key is of rounded numbers."""
-    digest = hashlib.sha256()
-    if is_shell(geometry):
-        for array in triangles(geometry):
-            digest.update(array.tobytes())
-    elif geometry.getNodeType() == coal.GEOM_CONVEX:
-        digest.update(np.array(geometry.points()).tobytes())
-    cloud = cloud_of(geometry)
-    if cloud is not None:
-        digest.update(cloud.points.tobytes() + repr(cloud.radius).encode())
-    return digest.digest()
+    return json.dumps([name, joint]).encode() + shape_digest(geometry) + place
 
 
 @cache

@@ -57,12 +57,15 @@ class Kernel:
             raise shape_error(states, ("N", self.robot.dof), "states")
         return states
 
-    def unproved(self, q: ArrayLike, threads: int = 1) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def unproved(
+        self, q: ArrayLike, threads: int = 1, most: int = MOST_PAIRS
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the pairs that the spheres do not prove to be apart at states, shape (N, dof).
 
         Args:
             q: States.
             threads: Number of threads that share many states; the result is the same.
+            most: Largest number K of pairs that are listed for one state.
 
         Returns:
             Pairs, shape (N, K, 2): two bodies, or a body and -1 - obstacle; and their number, shape (N,): 0 where
@@ -70,7 +73,7 @@ class Kernel:
             -2 where it is proved to collide.
         """
         states = self.states(q)
-        found = np.empty((len(states), MOST_PAIRS, 2), np.int64)
+        found = np.empty((len(states), most, 2), np.int64)
         counts = np.empty(len(states), np.int64)
 
         def check(rows: slice) -> None:

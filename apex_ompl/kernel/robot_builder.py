@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.kernel.clearance_table import ClearanceTable, table_arrays
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, LIMIT_SLACK, RobotArrays
 from apex_ompl.kernel.joint_tree import ClusterBall, JointTree, Member, transformed
 from apex_ompl.kernel.products import product
@@ -27,6 +28,7 @@ def robot_tables(
     bodies: Sequence[BodySpec],
     pairs: Sequence[tuple[int, int]],
     numbers: Sequence[int] | None = None,
+    clearances: Mapping[tuple[int, int], ClearanceTable] | None = None,
 ) -> RobotTables:
     """Return the tables of a robot.
 
@@ -39,9 +41,10 @@ def robot_tables(
         bodies: The solids.
         pairs: Places of the bodies that are checked against each other.
         numbers: Numbers of the bodies outside of the tables; by default their places.
+        clearances: Tables of clearances of some of the pairs.
     """
     given = range(len(bodies)) if numbers is None else numbers
-    return _Builder(tree, bodies, lower, upper).tables(name, tuple(joint_names), pairs, given)
+    return _Builder(tree, bodies, lower, upper).tables(name, tuple(joint_names), pairs, given, clearances or {})
 
 
 class _Builder:
@@ -76,8 +79,9 @@ class _Builder:
         return (home, number if home == 0 else int(body.meets_scene))
 
     def tables(
-        self, name: str, joint_names: tuple[str, ...], pairs: Sequence[tuple[int, int]], numbers: Sequence[int]
-    ) -> RobotTables:
+        self, name: str, joint_names: tuple[str, ...], pairs: Sequence[tuple[int, int]], numbers: Sequence[int],
+        clearances: Mapping[tuple[int, int], ClearanceTable],
+    ) -> RobotTables:  # fmt: skip
         joints, bodies = self.tree.joints, self.bodies
         rows = sorted(self.number, key=lambda b: self.number[b])
         inner = {k for ks in self.lazy for k in ks}
@@ -88,6 +92,8 @@ class _Builder:
         pair_rows = self._pairs(pairs)
         pair_balls = self._pair_balls(pair_rows, balls, outer)
         parts = [self._part_balls(*part, outer) for part in self.parts]
+        tables = {tuple(sorted(self.number[b] for b in pair)): table for pair, table in clearances.items()}
+        body_rows = [row for _, _, rows in pair_rows for row in rows]
         arrays = RobotArrays(
             joint_parent=_ints([j.parent for j in joints]),
             joint_kind=_ints([j.kind for j in joints]),
@@ -109,7 +115,7 @@ class _Builder:
             pair_clusters=_ints([key for key, _, _ in pair_rows]).reshape(-1, 2),
             pair_common=_ints([common for _, common, _ in pair_rows]),
             pair_bodies=_spans([len(rows) for _, _, rows in pair_rows]),
-            bodies=_ints([row for _, _, rows in pair_rows for row in rows]).reshape(-1, 2),
+            bodies=_ints(body_rows).reshape(-1, 2),
             joint_rotation=np.array([p[:3, :3] for p in self.tree.placements]),
             joint_offset=np.array([p[:3, 3] for p in self.tree.placements]),
             joint_ratio=np.array([j.ratio for j in joints], float),
@@ -132,6 +138,7 @@ class _Builder:
             pair_outer=np.array([[b.outer for b in two] for two in pair_balls]).reshape(-1, 2),
             pair_parts=_ints([self._pair_parts(clusters, rows) for clusters, _, rows in pair_rows]).reshape(-1, 2),
             run_pairs=pair_runs(_ints([key for key, _, _ in pair_rows]).reshape(-1, 2)),
+            **table_arrays([tables.get(row) for row in body_rows], joint_names),
         )
         return RobotTables(name, joint_names, tuple(b.name for b in bodies), tuple(numbers[b] for b in rows), arrays)
 

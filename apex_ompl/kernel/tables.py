@@ -26,7 +26,8 @@ from apex_ompl.util.files import is_file, write_atomically
 from apex_ompl.util.validation import check_indices
 
 PARTS = ("cluster_parts", "cluster_range", "part_lazy", "part_bodies", "part_ball", "part_outer")
-MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer", "pair_parts", "run_pairs", *PARTS}
+CLEARANCES = ("bodies_table", "table_joints", "table_cells", "table_range", "table_bytes")
+MADE = {"body_inner", "inner_ball", "pair_ball", "pair_outer", "pair_parts", "run_pairs", *PARTS, *CLEARANCES}
 """Arrays of a robot that make checks faster; they are not stored."""
 
 
@@ -301,7 +302,7 @@ class RobotTables:
         kept = np.array([set(row) != both for row in a.bodies.tolist()], bool)
         before = np.concatenate([[0], np.cumsum(kept)])
         spans = np.array([(before[k], before[k + n] - before[k]) for k, n in a.pair_bodies], np.int64).reshape(-1, 2)
-        arrays = a._replace(pair_bodies=spans, bodies=a.bodies[kept])
+        arrays = a._replace(pair_bodies=spans, bodies=a.bodies[kept], bodies_table=a.bodies_table[kept])
         return RobotTables(self.name, self.joint_names, self.body_names, self.numbers, arrays)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -369,6 +370,9 @@ def _as_whole(stored: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
         "cluster_range": np.zeros((len(clusters), 2)), "part_lazy": stored["cluster_lazy"],
         "part_bodies": stored["cluster_bodies"], "part_ball": np.repeat(ball[:, None], BINS, axis=1),
         "part_outer": np.repeat(outer[:, None], BINS, axis=1),
+        "bodies_table": np.full(len(stored["bodies"]), -1, np.int64), "table_joints": np.empty((0, 3), np.int64),
+        "table_cells": np.empty((0, 2), np.int64), "table_range": np.empty((0, 3, 2)),
+        "table_bytes": np.empty(0, np.int64),
     }  # fmt: skip
 
 

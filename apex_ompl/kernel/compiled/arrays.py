@@ -53,6 +53,11 @@ class RobotArrays(NamedTuple):
     is fixed to it, is not. ``pair_parts`` has a bit for each part of these clusters that the pair is about.
     ``run_pairs`` are runs of at most RUN pairs of a cluster with others that follow each other: that cluster, the first
     of the others, the first pair, and their number.
+
+    ``bodies_table`` is the clearance table of each of ``bodies``, or -1, see
+    :mod:`apex_ompl.kernel.compiled.check.clearance_table`. ``table_joints`` are the one to three planned joints that it
+    depends on (else -1), ``table_cells`` its first byte and number of cells along each axis, ``table_range`` for each
+    joint the lowest value and cells per unit, ``table_bytes`` eight bytes in each number.
     """
 
     joint_parent: Integers
@@ -98,6 +103,11 @@ class RobotArrays(NamedTuple):
     pair_outer: Annotated[Floats, 2]
     pair_parts: Pairs
     run_pairs: Annotated[Integers, 4]
+    bodies_table: Integers
+    table_joints: Annotated[Integers, 3]
+    table_cells: Pairs
+    table_range: Annotated[Floats, 3, 2]
+    table_bytes: Integers
 
 
 class SceneArrays(NamedTuple):

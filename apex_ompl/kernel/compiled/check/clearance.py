@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.check.clearance_table import clearance_of_cell
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.geometry.signed_distance import direction, distance, is_allowed, next_obstacles
 from apex_ompl.kernel.compiled.layout import Floats
@@ -109,8 +110,20 @@ def nearest_bodies(t: RobotArrays, w: Workspace, q: Floats, limit: float) -> Nea
         for k in range(first, first + t.pair_bodies[p, 1]):
             m, n = t.bodies[k, 0], t.bodies[k, 1]
             if not marked or (w.near[m] and w.near[n]):
-                best = nearest_leaves(t, w, m, n, best)
+                best = nearest_of_bodies(t, w, q, k, best)
     return best
+
+
+@inlined
+def nearest_of_bodies(t: RobotArrays, w: Workspace, q: Floats, k: int, best: Nearest) -> Nearest:
+    """Return the nearer of ``best`` and the nearest leaves of pair ``k`` of bodies, not nearer than its table shows."""
+    apart = clearance_of_cell(t, k, q) if t.bodies_table[k] >= 0 else 0.0
+    if apart > 0.0 and apart >= best[0]:
+        return best
+    found = nearest_leaves(t, w, t.bodies[k, 0], t.bodies[k, 1], best)
+    if apart > 0.0 and found[0] < best[0]:
+        found = (max(found[0], apart), found[1], found[2], found[3], found[4])
+    return found
 
 
 @inlined

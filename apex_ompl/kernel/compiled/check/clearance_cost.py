@@ -19,7 +19,7 @@ from apex_ompl.kernel.compiled.check.clearance import (
     Nearest,
     gradient_between_bodies,
     gradient_to_obstacle,
-    nearest_leaves,
+    nearest_of_bodies,
     nearest_to_obstacle,
 )
 from apex_ompl.kernel.compiled.compilation import reassociating_inlined
@@ -78,7 +78,7 @@ def nearest_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, margin: flo
     for k in range(first, first + t.pair_bodies[p, 1]):
         m, n = t.bodies[k, 0], t.bodies[k, 1]
         if a == b or (w.near[m] and w.near[n]):
-            near = nearest_leaves(t, w, m, n, near)
+            near = nearest_of_bodies(t, w, q, k, near)
     return near
 
 

@@ -31,7 +31,7 @@ FAR, FAST = 0.005, 2.0  # distance [m], and displacement relative to it, from wh
 
 
 @inlined
-def _set_guess(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> None:
+def set_guess(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> None:
     """Set the first direction: from ball to ball, of nodes or, for -1, of whole shapes."""
     for i in range(3):
         a, b = g.ball[0, i], g.ball[1, i]
@@ -47,7 +47,7 @@ def _set_guess(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> None:
 
 
 @inlined
-def _set_node(h: ShapeArrays, g: PairBuffers, s: int, node: int) -> None:
+def set_node(h: ShapeArrays, g: PairBuffers, s: int, node: int) -> None:
     """Set the piece of side ``s``: a triangle or a point for a leaf, else the node's ball on side 0, its box on 1."""
     r, o, b = g.rotation[s], g.origin[s], h.node_ball[node]
     if h.child[node] < 0:
@@ -94,7 +94,7 @@ def _in_frame(r: Floats, x: float, y: float, z: float) -> tuple[float, float, fl
 
 
 @outlined
-def _nodes_apart(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> float:
+def nodes_apart(h: ShapeArrays, g: PairBuffers, m: int, n: int) -> float:
     """Return a lower bound of the distance of two nodes, -1 for a side that is a single piece [m].
 
     It is that of their balls, or of the ball of the first from the box of the second.
@@ -154,7 +154,7 @@ def _inner_bound(
         return max(apart, _ball_and_box_bound(h, g)) if first_order else apart
     if g.corners[1] == 1 and g.kind[1] == HULL:  # a ball from a point is exact
         return apart
-    _set_guess(h, g, m, n)
+    set_guess(h, g, m, n)
     distance = convex_distance(corners_of(h), g, limit + arc)[0]
     if first_order and distance > 0.0 and distance - arc < limit:
         return float(convex_bound(corners_of(h), g, distance))
@@ -169,7 +169,7 @@ def _leaves_bound(
     if not first_order and m >= 0 and n >= 0 and h.corner[n] <= POINT:
         distance = _point_to_triangle(h, g, h.corner[m], POINT - h.corner[n])
         return distance - arc, distance
-    _set_guess(h, g, m, n)
+    set_guess(h, g, m, n)
     distance, upper = convex_distance(corners_of(h), g, limit + arc)
     if distance - arc >= limit:
         return distance - arc, math.inf
@@ -203,15 +203,15 @@ def _mesh_bound(
     while top > 0:
         top -= 1
         m, n = g.nodes[top, 0], g.nodes[top, 1]
-        apart = _nodes_apart(h, g, m, n) - arc
+        apart = nodes_apart(h, g, m, n) - arc
         if apart >= min(need, bound):
             bound = min(bound, apart)
             continue
         inner, other = m >= 0 and h.child[m] >= 0, n >= 0 and h.child[n] >= 0
         if m >= 0:
-            _set_node(h, g, 0, m)
+            set_node(h, g, 0, m)
         if n >= 0:
-            _set_node(h, g, 1, n)
+            set_node(h, g, 1, n)
         limit = min(need, bound)
         if not (inner or other):
             here, upper = _leaves_bound(h, g, m, n, arc, limit, first_order)
@@ -227,12 +227,12 @@ def _mesh_bound(
             return -math.inf, least
         if inner and (not other or h.node_ball[m, 3] >= h.node_ball[n, 3]):
             first = h.child[m]
-            swap = _nodes_apart(h, g, first, n) < _nodes_apart(h, g, first + 1, n)
+            swap = nodes_apart(h, g, first, n) < nodes_apart(h, g, first + 1, n)
             g.nodes[top, 0], g.nodes[top + 1, 0] = (first + 1, first) if swap else (first, first + 1)
             g.nodes[top, 1] = g.nodes[top + 1, 1] = n
         else:
             first = h.child[n]
-            swap = _nodes_apart(h, g, m, first) < _nodes_apart(h, g, m, first + 1)
+            swap = nodes_apart(h, g, m, first) < nodes_apart(h, g, m, first + 1)
             g.nodes[top, 1], g.nodes[top + 1, 1] = (first + 1, first) if swap else (first, first + 1)
             g.nodes[top, 0] = g.nodes[top + 1, 0] = m
         top += 2  # the nearer one is examined first
@@ -273,7 +273,7 @@ def _pair_bound(f: Frames, h: ShapeArrays, a: int, b: int, g: PairBuffers, need:
         return half_space_distance(g, h, b)
     place_shape(f, h, b, g, 1)
     set_relative_motion(f, g, 1, j, i)
-    _set_guess(h, g, -1, -1)
+    set_guess(h, g, -1, -1)
     arc = min(g.arc_bound[0], g.arc_bound[1])
     bound = -math.inf
     if h.depth[b] < math.inf:  # the hull of points that are all over the scene is no help

@@ -58,7 +58,7 @@ def place_shape(f: Frames, h: ShapeArrays, row: int, g: PairBuffers, s: int) -> 
 
 
 @inlined
-def _chain(f: Frames, g: PairBuffers, joint: int, other: int) -> tuple[int, int]:
+def set_chain(f: Frames, g: PairBuffers, joint: int, other: int) -> tuple[int, int]:
     """Put the joints from ``joint`` to ``other`` into ``g.chain``, both ends included.
 
     Returns:
@@ -83,7 +83,7 @@ def _chain(f: Frames, g: PairBuffers, joint: int, other: int) -> tuple[int, int]
 @outlined
 def set_relative_motion(f: Frames, g: PairBuffers, s: int, joint: int, other: int) -> None:
     """Set velocity, turn and bounds of side ``s``, fixed to ``joint``, as seen from the other side's joint."""
-    mine, count = _chain(f, g, joint, other)
+    mine, count = set_chain(f, g, joint, other)
     x, y, z, spread = g.ball[s, 0], g.ball[s, 1], g.ball[s, 2], g.ball[s, 3]
     moved = deviated = levers = curvature = vx = vy = vz = ox = oy = oz = 0.0
     for i in range(count):

@@ -2,7 +2,8 @@
 
 A pair is proved apart when the distance of all spheres that still have to be examined exceeds their radii plus a bound
 on their displacement (:mod:`apex_ompl.kernel.compiled.robot.motion_bound`). The cover contains the solids, so that a
-proved pair is free of collision; a pair that is not proved may be either.
+proved pair is free of collision; a pair that is not proved may be either. Two links with a table of clearances
+(:mod:`apex_ompl.kernel.compiled.check.clearance_table`) are proved apart by it first.
 
 A body is proved to collide with an obstacle where a ball inside of the body meets it. The meshes would find the same:
 an obstacle that meets a ball inside of a closed solid either crosses its surface or is inside of it.
@@ -13,6 +14,7 @@ from __future__ import annotations
 import math
 
 from apex_ompl.kernel.compiled.arrays import GRID, LIMIT_SLACK, RUN, RobotArrays, SceneArrays
+from apex_ompl.kernel.compiled.check.clearance_table import clearance_of_box
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.geometry.bounding_trees import items_apart
 from apex_ompl.kernel.compiled.geometry.grid_distance import FARTHER, compare
@@ -226,6 +228,8 @@ def unproved_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, found: Int
         u, v = w.root[m], w.root[n]
         apart = t.node_radius[t.body_root[m]] + t.node_radius[t.body_root[n]] + shift
         if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
+            continue
+        if t.bodies_table[k] >= 0 and clearance_of_box(t, k, q, w.half_width) > w.margin[0]:
             continue
         if not bodies_clear(t, w, m, n, shift):
             found[count, 0], found[count, 1] = m, n

@@ -1,0 +1,219 @@
+"""Makes the tables of clearances of a robot's links, see :mod:`apex_ompl.collision.clearance_tables`.
+
+A table is a grid of cells over the values of one to three joints. Where the exact shapes are not proved apart over a
+whole cell (:mod:`apex_ompl.kernel.compiled.check.box_bound`), it is halved along each axis. Tables are made for pairs
+that the sphere covers leave open at some states, those that are open most often first, and those of three joints last.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from apex_ompl.collision.clearance_tables import (
+    Cells,
+    NearPair,
+    clearance_file,
+    near_pairs,
+    read_clearances,
+    table_of,
+    table_range,
+    write_clearances,
+)
+from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays
+from apex_ompl.collision.mesh_stage import MeshStage
+from apex_ompl.collision.tables import joint_tree, make_tables
+from apex_ompl.kernel.arrays import pack
+from apex_ompl.kernel.box_bound import BoxBounds
+from apex_ompl.kernel.clearance_table import LARGEST, UNIT
+from apex_ompl.kernel.kernel import Kernel
+from apex_ompl.kernel.products import product
+from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.robot import Robot
+from apex_ompl.types import Array
+from apex_ompl.util.files import check_writable, is_file
+
+ROUNDING = 1e-9  # by which cells are widened [rad], [m]
+FIRST, LAST = 3, (10, 7, 6)  # levels: 2^n cells along each axis at first, and at last by the number of joints
+SHARE = 1 / 3  # of the time that is left, for one table
+SAFE = 1e-6  # by which bounds are lowered [m]
+ENOUGH = 5e-4  # bound with which a cell is not divided further [m]
+SAMPLES = 500  # states at which the covers are tried
+AT_ONCE = 256  # cells between two readings of the clock
+
+
+@dataclass(frozen=True, eq=False)
+class TableReport:
+    """What was found for one table.
+
+    Attributes:
+        names: Names of the links.
+        joints: Names of the planned joints between them.
+        unproved: Share of random states at which the covers leave the pair open.
+        proved: Share of the range of the joints that the table proves.
+        cells: Number of cells along each axis.
+        seconds: CPU time [s].
+        complete: Whether the time budget sufficed.
+    """
+
+    names: tuple[str, str]
+    joints: tuple[str, ...]
+    unproved: float
+    proved: float
+    cells: int
+    seconds: float
+    complete: bool
+
+    def __str__(self) -> str:
+        """Return a line for a log."""
+        left = "" if self.complete else ", stopped by the time budget"
+        return (
+            f"{self.names[0]} and {self.names[1]} ({', '.join(self.joints)}): {self.unproved:.1%} of states open by "
+            f"covers, {self.proved:.1%} of the range proved, {self.cells} cells an axis, {self.seconds:.1f} s{left}"
+        )
+
+
+class TableMaker:
+    """Makes the tables of a robot's pairs of links, those first that the covers leave open most often."""
+
+    def __init__(self, robot: Robot) -> None:
+        """Make tables for ``robot``.
+
+        Raises:
+            MissingFileError: The robot names a file of covers that cannot be read.
+            FileFormatError: That file does not follow its schema.
+            RobotError: The kernel does not support the motion of a joint.
+        """
+        stage, tree = MeshStage(robot), joint_tree(robot)
+        self._robot, self._solids = robot, [stage.solids[k] for k in range(stage.links)]
+        tables = make_tables(robot, self._solids, [False] * stage.links, stage.body_pairs)
+        self._kernel = Kernel(tables, scene_tables([]))
+        self._row = {number: row for row, number in enumerate(tables.numbers)}
+        bodies = [self._solids[number] for number in tables.numbers]
+        arrays = shape_arrays(
+            [PlacedShape(s.shape, s.joint, product(tree.turns[s.joint].T, s.placement.homogeneous)) for s in bodies]
+        )
+        self._radii, self._bounds = arrays.ball[:, 3], BoxBounds(self._kernel, pack(arrays))
+        near, shares = near_pairs(robot, tree, self._solids, stage.body_pairs), self._open_shares()
+        self.pairs = sorted(
+            (p for p in near if p.links in shares), key=lambda p: (len(p.sources) // 3, -shares[p.links], p.links)
+        )
+        self.shares = [shares[pair.links] for pair in self.pairs]
+
+    def names(self, pair: NearPair) -> tuple[str, str]:
+        """Return the names of a pair's links."""
+        first, second = (self._solids[k] for k in pair.links)
+        return first.part or first.name, second.part or second.name
+
+    def _open_shares(self) -> dict[tuple[int, int], float]:
+        """Return for pairs of links the share of random states at which the covers leave them open."""
+        states, numbers = self._robot.random_state(np.random.default_rng(0), SAMPLES), self._kernel.robot.numbers
+        left, counts = self._kernel.unproved(states, most=len(self._kernel.robot.arrays.bodies) + 1)
+        found = np.concatenate([rows[: max(count, 0)] for rows, count in zip(left, counts, strict=True)])
+        counted = Counter((min(pair), max(pair)) for pair in ((numbers[a], numbers[b]) for a, b in found.tolist()))
+        return {pair: count / SAMPLES for pair, count in counted.items()}
+
+    def bounds(self, pair: NearPair, middles: Array, half: Array, *, least: float, need: float) -> Array:
+        """Return :meth:`apex_ompl.kernel.box_bound.BoxBounds.over` of two links, the smaller of which moves."""
+        first, second = sorted((self._row[k] for k in pair.links), key=lambda row: self._radii[row])
+        return self._bounds.over(first, second, middles, half, least=least, need=need)
+
+    def make(self, pair: NearPair, seconds: float) -> tuple[Cells, bool]:
+        """Return the cells of a pair's table, and whether the CPU time sufficed [s]; cells are unproved where not."""
+        lower, upper = table_range(self._robot, pair)
+        axes, start = list(pair.sources), time.process_time()
+        last = LAST[len(axes) - 1]
+        for level in range(FIRST, last + 1):
+            n = 2**level
+            if level == FIRST:
+                cells, left = np.zeros((n,) * len(axes), np.uint8), np.ones((n,) * len(axes), bool)
+            else:
+                cells, left = (_doubled(array) for array in (cells, left))
+            width = (upper - lower) / n
+            half, middle = np.zeros(self._robot.dof), (self._robot.limits.lower + self._robot.limits.upper) / 2.0
+            half[axes] = width / 2.0 + ROUNDING
+            enough = UNIT if level == last else ENOUGH
+            places = np.argwhere(left)
+            for some in np.array_split(places, len(places) // AT_ONCE + 1):
+                if time.process_time() - start > seconds:
+                    return cells, False
+                middles = np.repeat(middle[None], len(some), axis=0)
+                middles[:, axes] = lower + (some + 0.5) * width
+                bounds = self.bounds(pair, middles, half, least=enough + SAFE, need=(LARGEST + 1) * UNIT + SAFE)
+                proved = bounds >= enough + SAFE
+                at = tuple(some[proved].T)
+                cells[at] = np.minimum((bounds[proved] - SAFE) / UNIT, LARGEST)
+                left[at] = False
+            if not left.any():
+                break
+        return cells, True
+
+
+def _doubled(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array with each element twice along each axis."""
+    for axis in range(array.ndim):
+        array = np.repeat(array, 2, axis)
+    return array
+
+
+def make_clearances(
+    robot: Robot, seconds: float = 60.0, progress: Callable[[TableReport], None] | None = None,
+    known: Mapping[str, Cells] | None = None,
+) -> dict[str, Cells]:  # fmt: skip
+    """Return the cells of the tables of a robot, by the digests of their pairs.
+
+    Args:
+        robot: The robot; tables that it has are not used.
+        seconds: CPU time for all of them [s]; see above.
+        progress: Called with what was found for each table.
+        known: Tables that were made before, which are kept.
+
+    Raises:
+        MissingFileError: The robot names a file of covers that cannot be read.
+        FileFormatError: That file does not follow its schema.
+        RobotError: The kernel does not support the motion of a joint.
+    """
+    found, start, maker = dict(known or {}), time.process_time(), TableMaker(robot)
+    for pair, share in zip(maker.pairs, maker.shares, strict=True):
+        began = time.process_time()
+        if pair.key in found or began - start > seconds:
+            continue
+        cells, complete = maker.make(pair, SHARE * (seconds - (began - start)))
+        if cells.any():
+            found[pair.key] = cells
+        if progress is not None:
+            table, took = table_of(robot, pair, cells), time.process_time() - began
+            progress(TableReport(maker.names(pair), table.joints, share, table.proved, len(cells), took, complete))
+    return found
+
+
+def prepare_clearances(
+    robot: Robot, seconds: float = 60.0, progress: Callable[[TableReport], None] | None = None
+) -> Path:  # fmt: skip
+    """Make the tables that a robot's file lacks, and write them; return the file.
+
+    Tables of other robots, or of this one before it was changed, are removed from it.
+
+    Args:
+        robot: The robot.
+        seconds: CPU time [s], see :func:`make_clearances`.
+        progress: See :func:`make_clearances`.
+
+    Raises:
+        MissingFileError: The robot's covers cannot be read, or the folder of the file cannot be written.
+        FileFormatError: One of these files does not follow its schema.
+        RobotError: The kernel does not support the motion of a joint.
+    """
+    path = clearance_file(robot)
+    check_writable(path)
+    keys = {pair.key for pair in TableMaker(robot).pairs}
+    known = {key: cells for key, cells in (read_clearances(path) if is_file(path) else {}).items() if key in keys}
+    write_clearances(path, make_clearances(robot, seconds, progress, known))
+    return path
