@@ -196,8 +196,8 @@ def make_clearances(
 
 def prepare_clearances(
     robot: Robot, seconds: float = 60.0, progress: Callable[[TableReport], None] | None = None
-) -> Path:  # fmt: skip
-    """Make the tables that a robot's file lacks, and write them; return the file.
+) -> Path | None:  # fmt: skip
+    """Make the tables that a robot's file lacks, and write them; return the file, or None where there is no table.
 
     Tables of other robots, or of this one before it was changed, are removed from it.
 
@@ -215,5 +215,8 @@ def prepare_clearances(
     check_writable(path)
     keys = {pair.key for pair in TableMaker(robot).pairs}
     known = {key: cells for key, cells in (read_clearances(path) if is_file(path) else {}).items() if key in keys}
-    write_clearances(path, make_clearances(robot, seconds, progress, known))
+    made = make_clearances(robot, seconds, progress, known)
+    if not made and not is_file(path):
+        return None
+    write_clearances(path, made)
     return path

@@ -1,8 +1,9 @@
 """What is computed once for a robot: pairs of links that need no check, and sphere covers of its links.
 
 Files are written beside the robot file as soon as there is something to write, and name how far they are, so that a
-preparation that was stopped goes on where it was. Covers are made quickly for all links first; then those of the links
-that spoil most proofs are made anew, thoroughly, as long as the time lasts.
+preparation that was stopped goes on where it was. Covers are made quickly for all links first, then tables of the clearances of
+near links that these leave open; last, the covers of the links that still spoil most proofs are made anew, thoroughly,
+as long as the time lasts.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import coal
 import numpy as np
 
 from apex_ompl.collision.checker import CollisionChecker
+from apex_ompl.collision.clearance_making import TableReport, prepare_clearances
 from apex_ompl.collision.cover.pairs import PairSearch, disabled_pairs
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.spheres import FULL, make_cover, read_covers, read_efforts, shape_key, write_covers
@@ -32,6 +34,7 @@ from apex_ompl.util.validation import check_integer, check_positive
 
 SAMPLES = 500  # states at which it is measured which links spoil proofs
 PAIRS_SHARE = 0.3  # of the budget, for pairs
+TABLES_SHARE, MOST_FOR_TABLES = 0.5, 60.0  # of the time that is left then, for tables of near links, and most [s]
 COMMAND = "apex-ompl robot prepare"
 
 
@@ -67,7 +70,7 @@ class Prepared(NamedTuple):
         covers: Effort -> number of shapes whose covers were made by it, in all runs.
         missing: Shapes without a cover in the file.
         thorough: Whether nothing is left to do.
-        files: The files of pairs and covers.
+        files: The files of pairs, covers and tables of clearances.
     """
 
     pairs: int
@@ -105,14 +108,33 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
     _name_in(path, {"disabled_pairs": pairs_file})
     covers = _Covers(robot, covers_file, settings, deadline, report)
     covers.make(dict.fromkeys(covers.shapes, 1.0), 1)
+    files = [pairs_file, covers_file]
     if covers_file.exists():
         _name_in(path, {"covers": covers_file})
+        files += _prepare_tables(path, settings, deadline, report)
         if settings.effort > 1 and time.monotonic() < deadline:
             covers.make(_weights(path, robot), settings.effort)
     efforts = [covers.efforts.get(key, 0) for key in covers.shapes]
     numbers = {effort: efforts.count(effort) for effort in sorted({*efforts} - {0})}
     thorough = complete and min(efforts, default=FULL) >= settings.effort
-    return Prepared(count, numbers, efforts.count(0), thorough, (pairs_file, covers_file))
+    return Prepared(count, numbers, efforts.count(0), thorough, tuple(files))
+
+
+def _prepare_tables(path: Path, settings: Preparation, deadline: float, report: Report) -> list[Path]:
+    """Write the tables of clearances of links that the covers leave open, and return their file."""
+    stage, seconds = "near links", min(MOST_FOR_TABLES, TABLES_SHARE * (deadline - time.monotonic()))
+    if seconds <= 0.0:
+        return []
+    spent = 0.0
+
+    def progress(made: TableReport) -> None:
+        nonlocal spent
+        spent += made.seconds
+        report(stage, min(1.0, spent / seconds))
+
+    file = prepare_clearances(build_robot(read_config(path), path), seconds, progress)
+    report(stage, 1.0)
+    return [] if file is None else [file]
 
 
 def _prepare_pairs(
