@@ -156,7 +156,8 @@ class FitSettings:
         first: Residual from which points do not count at the first step [m].
         last: The same at the end [m].
         reach: The same of the contour [m].
-        steps: Number of steps.
+        steps: Number of steps at most.
+        settled: Shift, and a tenth of the turn [rad] and of the growth, of a step that is the last one [m].
     """
 
     noise: float
@@ -168,6 +169,7 @@ class FitSettings:
     last: float
     reach: float
     steps: int
+    settled: float = 0.0
 
 
 class SurfaceFit(NamedTuple):
@@ -221,7 +223,7 @@ def fit_surface(
     shape = beyond.shape
     depth, index, matrix, cross = np.empty(shape), np.empty(shape, np.int64), np.empty((n, n)), np.empty((n, POSE))
     s = settings
-    numbers = s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach
+    numbers = s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach, s.settled
     cost = surface_fit.fit_surface(
         np.ascontiguousarray(points), len(points) if outline is None else outline, beyond, lens, vertices, faces,
         ties, symmetry, rotation, position, scale,

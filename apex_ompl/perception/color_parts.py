@@ -18,6 +18,7 @@ Mask = NDArray[np.bool_]
 
 APART = 0.04  # second difference of neighboring depths of different surfaces [m]
 BEFORE = 0.03  # by which an occluder is before an obstacle [m]
+JUST_BEFORE = 0.01  # the same of an occluder between two parts of one [m]
 PAD = 8  # around an obstacle's pixels [pixels]
 NEIGHBOR = 40  # pixels from a measured one within which pixels of the color belong to it
 FLYING = 3  # pixels from a measured one within which depths may be between both sides of an edge
@@ -207,7 +208,15 @@ def _occluded_between(first: ColorPart, second: ColorPart, depth: Array) -> bool
     if not len(line):
         return False
     between = depth[line[:, 0], line[:, 1]]
-    return bool(np.mean((between > 0.0) & (between < min(first.depth, second.depth) - BEFORE)) > 0.6)
+    ends = _depth_at(first, a[i]), _depth_at(second, b[j])
+    share = np.linalg.norm(line - a[i], axis=1) / np.linalg.norm(b[j] - a[i])
+    before = ends[0] + (ends[1] - ends[0]) * share - JUST_BEFORE
+    return bool(np.mean((between > 0.0) & (between < before)) > 0.6)
+
+
+def _depth_at(part: ColorPart, pixel: Indices) -> float:
+    """Return the depth of a part at a pixel of the image [m]."""
+    return float(part.filled[pixel[0] - part.top, pixel[1] - part.left])
 
 
 def _border(part: ColorPart) -> Indices:

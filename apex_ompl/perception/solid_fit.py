@@ -28,8 +28,9 @@ from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
-COARSE_STEPS, PROFILE_STEPS = 5, 3
-RIVALS, RIVAL = 3, 1.3  # fits that are refined at most, and their largest cost over the least
+FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 3, 4, 3
+HOPELESS = 1.8  # cost over the least, after the first steps, from which a start is given up
+RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
 STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
@@ -153,10 +154,13 @@ def _hypotheses(
 
 def _searched(patch: Patch) -> _Found | None:
     """Return the best fit from all starts."""
-    found = [_run(one, patch.coarse, COARSE_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
-    found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
-    if not found:
+    found = [_run(one, patch.coarse, FIRST_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
+    least = min((one.fit.cost for one in found), default=np.inf)
+    if not np.isfinite(least):
         return None
+    late = patch.coarse._replace(settings=replace(patch.coarse.settings, first=patch.coarse.settings.last))
+    found = [_run(one.solid, late, COARSE_STEPS) for one in found if one.fit.cost < HOPELESS * least]
+    found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
     rivals: list[_Found] = []
     for one in found:
         if one.fit.cost > RIVAL * found[0].fit.cost or len(rivals) == RIVALS:

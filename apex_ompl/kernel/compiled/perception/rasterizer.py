@@ -13,6 +13,7 @@ from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 
 NEAR = 0.02  # depth below which nothing is drawn [m]
+NARROW = 6  # columns up to which all pixels of a row are tested
 EDGE_ON = 1e-15  # determinant of a triangle seen from its edge [m^3]
 
 
@@ -31,6 +32,17 @@ def place_vertices(vertices: Floats, part: Integers, poses: Floats, placed: Floa
         x, y, z = vertices[k, 0], vertices[k, 1], vertices[k, 2]
         for r in range(3):
             placed[k, r] = poses[i, r, 0] * x + poses[i, r, 1] * y + poses[i, r, 2] * z + poses[i, r, 3]
+
+
+@inlined
+def _inside(slope: float, offset: float, fx: float, cx: float, start: int, end: int) -> tuple[int, int]:
+    """Return the columns, and one beside them, where slope (column - cx) / fx + offset is not positive."""
+    if slope == 0.0:
+        return start, end
+    border = min(max(cx - fx * offset / slope, start - 1.0), end + 1.0)
+    if slope > 0.0:
+        return start, min(end, int(math.floor(border)) + 1)
+    return max(start, int(math.ceil(border)) - 1), end
 
 
 @inlined
@@ -66,7 +78,12 @@ def draw(vertices: Floats, faces: Integers, lens: Floats, depth: Floats, index: 
         for row in range(top, bottom + 1):
             y = (row - cy) / fy
             us, vs, ws = uy * y + uz, vy * y + vz, wy * y + wz
-            for column in range(left, right + 1):
+            start, end = left, right
+            if right - left > NARROW:
+                start, end = _inside(ux, us, fx, cx, start, end)
+                start, end = _inside(vx, vs, fx, cx, start, end)
+                start, end = _inside(wx, ws, fx, cx, start, end)
+            for column in range(start, end + 1):
                 x = (column - cx) / fx
                 u, v, w = ux * x + us, vx * x + vs, wx * x + ws
                 if u <= 0.0 and v <= 0.0 and w <= 0.0:
