@@ -30,16 +30,18 @@ from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 3, 4, 3
 HOPELESS = 1.8  # cost over the least, after the first steps, from which a start is given up
+THOROUGH = 3  # times as many steps of a search where the first one explains too little
 RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
 STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
 UNLIKELY, MOST_LENGTHS = 14.0, 8  # cost above the least where lengths of the mixture end, and their number
 SHARP = 0.09  # standard deviation of the logarithm of a length below which it has no mixture
-VAGUE = 0.06  # standard deviation of the logarithm of a length above which it has a mixture of its own
+VAGUE = 0.04  # standard deviation of the logarithm of a length above which it has a mixture of its own
 KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
-MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
+UNEXPLAINED = 0.4  # standard deviation of ends of what one solid does not explain, over its largest length
+SUDDEN = 0.3  # relative increase of the misfit over which that spread comes
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
 LONGER = 1.3  # ratio of lengths that tells whether one is
 NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
@@ -121,49 +123,70 @@ def fitted(
     best = _searched(patch)
     if best is None:
         return None
-    misfit = max(1.0, best.fit.cost / (patch.fine.settings.point_share * patch.fine.measured) / MISFIT)
+    factor, misfit = settings.inflation / settings.tempering, _misfit(best, patch)
+    if misfit > settings.most_misfit:
+        best = _searched(patch, thorough=True) or best
+        misfit = _misfit(best, patch)
     sized = _of_known_size(best, patch, known)
     if sized is not None:
-        return _estimate(sized, misfit, seen)
-    parts = _hypotheses(best, misfit, patch, seen, settings)
+        return _honest(_estimate(sized, factor, seen), _misfit(sized, patch), settings)
+    parts = _hypotheses(best, factor, patch, seen, settings)
     if best.start.kind == "box" and settings.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
         parts = [(one + float(np.log(1.0 - settings.cubes)), solid) for one, solid in parts]
-        parts.append((cube.evidence + float(np.log(settings.cubes)), _estimate(cube, misfit, seen)))
-    return mixture(parts)
+        parts.append((cube.evidence + float(np.log(settings.cubes)), _estimate(cube, factor, seen)))
+    return _honest(mixture(parts), misfit, settings)
+
+
+def _misfit(found: _Found, patch: Patch) -> float:
+    """Return the mean squared error of points over that of noise."""
+    return float(found.fit.cost / (patch.fine.settings.point_share * patch.fine.measured))
+
+
+def _honest(one: Estimate, misfit: float, settings: ObstacleSettings) -> Estimate:
+    """Return an estimate with the errors that do not average out, and those of a solid that does not explain points.
+
+    Errors of both ends of an axis are independent: half the variance of one end is the center's, twice that the length's.
+    """
+    unexplained = UNEXPLAINED * float(one.solid.size.max()) * min(1.0, max(0.0, misfit / settings.most_misfit - 1.0) / SUDDEN)
+    variance = settings.systematic**2 + unexplained**2
+    more = np.diag(np.concatenate([np.zeros(3), np.full(3, variance / 2.0), 2.0 * variance / one.solid.size**2]))
+    return Estimate(one.solid, one.covariance + more)
 
 
 def _hypotheses(
-    best: _Found, misfit: float, patch: Patch, seen: CorrectedFrame, settings: ObstacleSettings
+    best: _Found, factor: float, patch: Patch, seen: CorrectedFrame, settings: ObstacleSettings
 ) -> list[tuple[float, Estimate]]:  # fmt: skip
     """Return estimates of different lengths along the axis that is known least, with logarithms of their evidence."""
-    alone = _estimate(best, misfit, seen)
+    alone = _estimate(best, factor, seen)
     end = _hidden_end(best, patch) if patch.hidden else None
     axis, side = end if end is not None else (_vague_axis(alone), 0.0)
     if axis is None:
         return [(best.evidence, alone)]
     held, deviation = _profile(best, axis, side, patch, settings)
     if len(held) < 2 or deviation <= SHARP:
-        more = misfit * deviation**2 - alone.covariance[6 + axis, 6 + axis]
+        more = factor * deviation**2 - alone.covariance[6 + axis, 6 + axis]
         return [(best.evidence, _spread(alone, axis, max(0.0, more)))]
     lengths = best.solid.size if end is not None else np.delete(best.solid.size, axis)
     odds = _odds(held, axis, float(np.log(lengths[axis] if end is not None else lengths).mean()))
     likely = [k for k, one in enumerate(odds) if one > max(odds) - NEGLIGIBLE]
-    return [(odds[k], _spread(_estimate(held[k], misfit, seen), axis, STEP**2 / 12.0, side)) for k in likely]
+    return [(odds[k], _spread(_estimate(held[k], factor, seen), axis, STEP**2 / 12.0, side)) for k in likely]
 
 
-def _searched(patch: Patch) -> _Found | None:
-    """Return the best fit from all starts."""
+def _searched(patch: Patch, *, thorough: bool = False) -> _Found | None:
+    """Return the best fit from all starts; a thorough search refines them all."""
     found = [_run(one, patch.coarse, FIRST_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
     least = min((one.fit.cost for one in found), default=np.inf)
     if not np.isfinite(least):
         return None
     late = patch.coarse._replace(settings=replace(patch.coarse.settings, first=patch.coarse.settings.last))
-    found = [_run(one.solid, late, COARSE_STEPS) for one in found if one.fit.cost < HOPELESS * least]
+    hopeless, rival, most = (np.inf, np.inf, len(found)) if thorough else (HOPELESS * least, RIVAL, RIVALS)
+    steps = THOROUGH * COARSE_STEPS if thorough else COARSE_STEPS
+    found = [_run(one.solid, late, steps) for one in found if one.fit.cost < hopeless]
     found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
     rivals: list[_Found] = []
     for one in found:
-        if one.fit.cost > RIVAL * found[0].fit.cost or len(rivals) == RIVALS:
+        if one.fit.cost > rival * found[0].fit.cost or len(rivals) == most:
             break
         if not any(_alike(one.solid, other.solid) for other in rivals):
             rivals.append(one)

@@ -128,8 +128,8 @@ def _fit_settings(settings: ObstacleSettings, stride: int, thinning: float, seen
     shared = max(1.0, (seen.camera.depth.correlation / stride) ** 2)
     return FitSettings(
         noise=seen.noise, floor=settings.floor, edge=settings.edge,
-        point_share=settings.point_share * thinning / shared / settings.inflation,
-        contour_share=settings.contour_share * stride / settings.inflation, first=FIRST, last=LAST, reach=0.02,
+        point_share=settings.point_share * thinning / shared / settings.tempering,
+        contour_share=settings.contour_share * stride / settings.tempering, first=FIRST, last=LAST, reach=0.02,
         steps=FINE_STEPS,
     )  # fmt: skip
 
