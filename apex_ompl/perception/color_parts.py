@@ -66,6 +66,7 @@ class ColorPart(NamedTuple):
         filled: Depths, those of the nearest pixel that has one where it has none of its own, shape (h, w) [m].
         depth: Its mean depth [m].
         size: Number of pixels with depths that are sure.
+        pieces: Parts that an occluder may divide, of which it was put together; none for most.
     """
 
     left: int
@@ -75,6 +76,7 @@ class ColorPart(NamedTuple):
     filled: Array
     depth: float
     size: int
+    pieces: tuple[ColorPart, ...] = ()
 
 
 def color_parts(
@@ -194,7 +196,8 @@ def _together(first: ColorPart, second: ColorPart) -> ColorPart:
         maybe[rows, columns] |= one.maybe
     depth = (first.depth * first.size + second.depth * second.size) / size
     filled = np.where(filled > 0.0, filled, depth)
-    return ColorPart(left, top, own, maybe, filled, depth, size)
+    pieces = (*(first.pieces or (first,)), *(second.pieces or (second,)))
+    return ColorPart(left, top, own, maybe, filled, depth, size, pieces)
 
 
 def _occluded_between(first: ColorPart, second: ColorPart, depth: Array) -> bool:

@@ -81,10 +81,17 @@ class KnownSize:
 
 
 class Estimate(NamedTuple):
-    """A solid with the covariance of turn, shift and logarithms of lengths in the optical frame, shape (9, 9)."""
+    """A solid that was fitted, in the optical frame.
+
+    Attributes:
+        solid: The solid.
+        covariance: Of turn, shift and logarithms of lengths, shape (9, 9).
+        misfit: Mean squared error of points over that of noise.
+    """
 
     solid: Solid
     covariance: Array
+    misfit: float = 1.0
 
 
 class _Found(NamedTuple):
@@ -151,7 +158,7 @@ def _honest(one: Estimate, misfit: float, settings: ObstacleSettings) -> Estimat
     unexplained = UNEXPLAINED * float(one.solid.size.max()) * min(1.0, max(0.0, misfit / settings.most_misfit - 1.0) / SUDDEN)
     variance = settings.systematic**2 + unexplained**2
     more = np.diag(np.concatenate([np.zeros(3), np.full(3, variance / 2.0), 2.0 * variance / one.solid.size**2]))
-    return Estimate(one.solid, one.covariance + more)
+    return Estimate(one.solid, one.covariance + more, misfit)
 
 
 def _hypotheses(
