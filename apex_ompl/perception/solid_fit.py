@@ -32,6 +32,7 @@ FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 3, 4, 3
 HOPELESS = 1.8  # cost over the least, after the first steps, from which a start is given up
 THOROUGH = 3  # times as many steps of a search where the first one explains too little
 RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
+GROWN = 1.06  # ratio of lengths of a last start to those of the best fit, which may be too short
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
 STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
@@ -199,7 +200,17 @@ def _searched(patch: Patch, *, thorough: bool = False) -> _Found | None:
             rivals.append(one)
     refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals]
     refined = [one for one in refined if np.isfinite(one.fit.cost)]
-    return min(refined, key=lambda one: one.fit.cost) if refined else None
+    if not refined:
+        return None
+    best = min(refined, key=lambda one: one.fit.cost)
+    return min(best, _run(_grown(best.solid, GROWN), patch.fine, FINE_STEPS), key=lambda one: one.fit.cost)
+
+
+def _grown(solid: Solid, ratio: float) -> Solid:
+    """Return a solid whose lengths are larger by a ratio, and whose near ends stay."""
+    for axis in range(3) if solid.kind == "box" else (0, 2):
+        solid = resized(solid, axis, ratio * float(solid.size[axis]))
+    return solid
 
 
 def _alike(first: Solid, second: Solid) -> bool:
