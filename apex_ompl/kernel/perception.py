@@ -200,6 +200,7 @@ class SurfaceFit(NamedTuple):
 def fit_surface(
     points: Array, beyond: Array, lens: Array, vertices: Array, faces: Integers, ties: Integers, symmetry: int,
     start: Array, expected: Array, prior: Array, settings: FitSettings, outline: int | None = None,
+    steps: int | None = None,
 ) -> SurfaceFit:  # fmt: skip
     """Fit the pose of a surface to points and to pixels that it must not cover.
 
@@ -217,6 +218,7 @@ def fit_surface(
             logarithms of the scales where these are unknown, shape (9, 9).
         settings: Weights and limits.
         outline: Points from this one on only have to be inside the outline; their depths are guessed.
+        steps: Number of steps at most where it is another than that of the settings.
     """
     n = len(prior)
     rotation, position, scale = start[:3, :3].copy(), start[:3, 3].copy(), np.ones(3)
@@ -227,7 +229,7 @@ def fit_surface(
     cost = surface_fit.fit_surface(
         np.ascontiguousarray(points), len(points) if outline is None else outline, beyond, lens, vertices, faces,
         ties, symmetry, rotation, position, scale,
-        expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), s.steps,
+        expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), s.steps if steps is None else steps,
         np.empty_like(vertices), depth, index, matrix, np.empty((n, n)), np.empty(n), cross, np.empty(n),
         np.empty(POSE),
     )  # fmt: skip

@@ -5,6 +5,7 @@ The color is looked for in every second row and column first, and exactly around
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -97,23 +98,20 @@ def color_parts(
     coarse = color.pixels(cv.resize(image[: 2 * half[1], : 2 * half[0]], half, interpolation=cv.INTER_NEAREST)).astype(
         np.uint8
     )
-    count, labels, stats, _ = cv.connectedComponentsWithStats(coarse, connectivity=8)
+    contours, _ = cv.findContours(coarse, cv.RETR_EXTERNAL, cv.CHAIN_APPROX_NONE)
     parts = []
-    for k in range(1, count):
-        if 4 * stats[k, cv.CC_STAT_AREA] < least:
+    for contour in contours:
+        x, y, width, height = cv.boundingRect(contour)
+        if 4 * width * height < least or 4 * (cv.contourArea(contour) + len(contour) / 2.0 + 1.0) < least:
             continue
-        left, top = (2 * max(0, int(stats[k, axis]) - PAD // 2) for axis in (cv.CC_STAT_LEFT, cv.CC_STAT_TOP))
-        right = 2 * (int(stats[k, cv.CC_STAT_LEFT] + stats[k, cv.CC_STAT_WIDTH]) + PAD // 2)
-        bottom = 2 * (int(stats[k, cv.CC_STAT_TOP] + stats[k, cv.CC_STAT_HEIGHT]) + PAD // 2)
+        left, top = 2 * max(0, x - PAD // 2), 2 * max(0, y - PAD // 2)
+        right, bottom = 2 * (x + width + PAD // 2), 2 * (y + height + PAD // 2)
         crop = slice(top, bottom), slice(left, right)
-        near = cv.dilate(
-            (labels[top // 2 : bottom // 2, left // 2 : right // 2] == k).astype(np.uint8), np.ones((3, 3))
-        )
         shape = depth[crop].shape
-        near = near.repeat(2, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]] > 0
-        own = np.zeros(shape, bool)
-        colored = _without_specks(color.pixels(image[crop]))
-        own[: near.shape[0], : near.shape[1]] = colored[: near.shape[0], : near.shape[1]] & near
+        filled = np.zeros(((shape[0] + 1) // 2, (shape[1] + 1) // 2), np.uint8)
+        cv.drawContours(filled, [contour], 0, 1, cv.FILLED, offset=(-(left // 2), -(top // 2)))
+        near = cv.dilate(filled, np.ones((3, 3), np.uint8)).repeat(2, axis=0).repeat(2, axis=1) > 0
+        own = _without_specks(color.pixels(image[crop])) & near[: shape[0], : shape[1]]
         parts += _connected(own, depth[crop], (left, top), noise=noise, least=least)
     return _merged(parts, depth, largest)
 
@@ -167,13 +165,14 @@ def _steps(depth: Array, limit: Array) -> Mask:
 
 def _merged(parts: list[ColorPart], depth: Array, largest: float) -> list[ColorPart]:
     """Return the parts, those of like depth with an occluder between them as one."""
-    found = list(parts)
-    k = 0
+    found, k = list(parts), 0
+    borders = {id(one): _border(one) for one in found} if len(found) > 1 else {}
     while k < len(found):
         for m in range(k + 1, len(found)):
             near = abs(found[k].depth - found[m].depth) < largest / 2.0
-            if near and _occluded_between(found[k], found[m], depth):
+            if near and _occluded_between(found[k], found[m], [borders[id(found[n])] for n in (k, m)], depth):
                 found[k] = _together(found[k], found.pop(m))
+                borders[id(found[k])] = _border(found[k])
                 break
         else:
             k += 1
@@ -200,9 +199,9 @@ def _together(first: ColorPart, second: ColorPart) -> ColorPart:
     return ColorPart(left, top, own, maybe, filled, depth, size, pieces)
 
 
-def _occluded_between(first: ColorPart, second: ColorPart, depth: Array) -> bool:
+def _occluded_between(first: ColorPart, second: ColorPart, borders: Sequence[Indices], depth: Array) -> bool:
     """Return whether an occluder is at most pixels between the nearest pixels of two parts."""
-    a, b = _border(first), _border(second)
+    a, b = borders
     apart = ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=-1)
     i, j = np.unravel_index(int(np.argmin(apart)), apart.shape)
     count = max(2, int(np.sqrt(apart[i, j])))

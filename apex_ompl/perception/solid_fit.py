@@ -29,8 +29,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 3, 4, 3
-HOPELESS = 1.8  # cost over the least, after the first steps, from which a start is given up
-THOROUGH = 3  # times as many steps of a search where the first one explains too little
+HOPELESS = 2.2  # cost over the least, after the first steps, from which a start is given up
 RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
 GROWN = 1.06  # ratio of lengths of a last start to those of the best fit, which may be too short
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
@@ -48,6 +47,7 @@ LONGER = 1.3  # ratio of lengths that tells whether one is
 NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
 NOT_SQUARE = 0.06  # logarithm of the ratio of sides from which on a box is no cube, beside the errors
 SLICES = 32
+TIES = {"box": np.array([0, 1, 2]), "cylinder": np.array([0, 0, 2])}  # unknown of the length along each axis
 ORDERS = tuple(permutations(range(3)))  # of known lengths along the axes of a box
 
 
@@ -128,13 +128,10 @@ def fitted(
         settings: How much measurements say.
         known: Sizes that it may have, or others.
     """
-    best = _searched(patch)
+    best = _searched(patch, settings.most_misfit)
     if best is None:
         return None
     factor, misfit = settings.inflation / settings.tempering, _misfit(best, patch)
-    if misfit > settings.most_misfit:
-        best = _searched(patch, thorough=True) or best
-        misfit = _misfit(best, patch)
     sized = _of_known_size(best, patch, known)
     if sized is not None:
         return _honest(_estimate(sized, factor, seen), _misfit(sized, patch), settings)
@@ -181,29 +178,36 @@ def _hypotheses(
     return [(odds[k], _spread(_estimate(held[k], factor, seen), axis, STEP**2 / 12.0, side)) for k in likely]
 
 
-def _searched(patch: Patch, *, thorough: bool = False) -> _Found | None:
-    """Return the best fit from all starts; a thorough search refines them all."""
+def _searched(patch: Patch, most_misfit: float) -> _Found | None:
+    """Return the best fit from all starts; those that were given up are tried where the others explain too little."""
     found = [_run(one, patch.coarse, FIRST_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
     least = min((one.fit.cost for one in found), default=np.inf)
     if not np.isfinite(least):
         return None
+    best = _refined([one for one in found if one.fit.cost < HOPELESS * least], patch)
+    if best is None or _misfit(best, patch) > most_misfit:
+        other = _refined([one for one in found if HOPELESS * least <= one.fit.cost < np.inf], patch)
+        best = min((one for one in (best, other) if one is not None), key=_cost, default=None)
+    return None if best is None else min(best, _run(_grown(best.solid, GROWN), patch.fine, FINE_STEPS), key=_cost)
+
+
+def _refined(found: Sequence[_Found], patch: Patch) -> _Found | None:
+    """Return the best of fits after more steps, the likely ones at full resolution."""
     late = patch.coarse._replace(settings=replace(patch.coarse.settings, first=patch.coarse.settings.last))
-    hopeless, rival, most = (np.inf, np.inf, len(found)) if thorough else (HOPELESS * least, RIVAL, RIVALS)
-    steps = THOROUGH * COARSE_STEPS if thorough else COARSE_STEPS
-    found = [_run(one.solid, late, steps) for one in found if one.fit.cost < hopeless]
-    found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
+    found = sorted((_run(one.solid, late, COARSE_STEPS) for one in found), key=_cost)
     rivals: list[_Found] = []
     for one in found:
-        if one.fit.cost > rival * found[0].fit.cost or len(rivals) == most:
+        if not one.fit.cost <= RIVAL * found[0].fit.cost or len(rivals) == RIVALS:
             break
         if not any(_alike(one.solid, other.solid) for other in rivals):
             rivals.append(one)
-    refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals]
-    refined = [one for one in refined if np.isfinite(one.fit.cost)]
-    if not refined:
-        return None
-    best = min(refined, key=lambda one: one.fit.cost)
-    return min(best, _run(_grown(best.solid, GROWN), patch.fine, FINE_STEPS), key=lambda one: one.fit.cost)
+    refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals if np.isfinite(one.fit.cost)]
+    return min((one for one in refined if np.isfinite(one.fit.cost)), key=_cost, default=None)
+
+
+def _cost(one: _Found) -> float:
+    """Return the cost of a fit."""
+    return one.fit.cost
 
 
 def _grown(solid: Solid, ratio: float) -> Solid:
@@ -226,17 +230,18 @@ def _run(
     """Return the fit from a start."""
     surface = _unit(start.kind)
     symmetry = 0 if start.kind == "box" else AXIS
-    tied = np.array(ties if ties is not None else (0, 1, 2) if start.kind == "box" else (0, 0, 2))
+    tied = TIES[start.kind] if ties is None else np.array(ties)
     before = _prior(start.kind) if prior is None else prior
     fit = fit_surface(
         level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry,
-        start.pose, start.pose, before, replace(level.settings, steps=steps), level.measured,
+        start.pose, start.pose, before, level.settings, level.measured, steps,
     )  # fmt: skip
     return _Found(start, fit, before, [*range(6), *(6 + tied)])
 
 
+@cache
 def _prior(kind: Kind) -> Array:
-    """Return the information before a fit, shape (9, 9)."""
+    """Return the information before a fit, shape (9, 9), which is not to be changed."""
     prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
     if kind == "cylinder":  # both diameters are one unknown
         prior[7, 7] = KNOWN
@@ -331,7 +336,7 @@ def _hidden_end(best: _Found, patch: Patch) -> tuple[int, float] | None:
 
 def _held(start: Solid, axis: int, level: Level) -> _Found:
     """Return the fit with a length that is held."""
-    prior = _prior(start.kind)
+    prior = _prior(start.kind).copy()
     prior[6 + axis, 6 + axis] = HELD
     return _run(start, level, PROFILE_STEPS, prior)
 
@@ -380,7 +385,7 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
             start = best.solid
             for axis in range(3):
                 start = resized(start, axis, float(size[axis]))
-            prior = _prior(one.kind)
+            prior = _prior(one.kind).copy()
             for axis in range(3) if one.kind == "box" else (0, 2):
                 prior[6 + axis, 6 + axis] = (size[axis] / one.spread) ** 2
             coarse = _run(start, patch.coarse, PROFILE_STEPS, prior)
@@ -396,6 +401,8 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
 
 def mixture(parts: Sequence[tuple[float, Estimate]]) -> Estimate:
     """Return the mean and the covariance of hypotheses, one or more; turns are those of the most likely one."""
+    if len(parts) == 1:
+        return parts[0][1]
     evidence = np.array([one for one, _ in parts])
     parts = [one for one, value in zip(parts, evidence, strict=True) if value > evidence.max() - NEGLIGIBLE]
     evidence = np.array([one for one, _ in parts])

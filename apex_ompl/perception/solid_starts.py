@@ -97,9 +97,9 @@ def starts(extent: Array, places: Array, normals: Array) -> list[Solid]:
         frames += [_turned(frames[0], np.pi / 4.0), _squared(extent, first)]
     boxes = [one for frame in frames for one in _boxes(frame, extent)]
     axes = [first] if second is None else [first, second]
-    round_one = _round_axis(normals)
-    if round_one is not None and all(abs(round_one @ axis) < SAME_AXIS for axis in axes):
-        axes.append(round_one)
+    for one in (_round_axis(normals), frames[0][:, 1]):
+        if one is not None and all(abs(one @ axis) < SAME_AXIS for axis in axes):
+            axes.append(one)
     return boxes + [one for axis in axes for one in _cylinders(axis, extent)]
 
 
