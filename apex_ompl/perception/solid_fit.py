@@ -28,7 +28,7 @@ from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
-FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 3, 4, 3
+FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 2, 4, 2
 HOPELESS = 2.2  # cost over the least, after the first steps, from which a start is given up
 RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
 GROWN = 1.06  # ratio of lengths of a last start to those of the best fit, which may be too short

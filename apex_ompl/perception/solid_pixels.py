@@ -22,9 +22,9 @@ Mask = NDArray[np.bool_]
 COARSE, FINE = 45, 90  # width or height of windows [pixels]
 COARSE_POINTS = 80
 COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at most
-FINE_STEPS = 8  # of a fit at most
+FINE_STEPS = 5  # of a fit at most
 FIRST, LAST = 0.04, 0.02  # residual from which points do not count at the first step of a search, and later [m]
-COARSE_SETTLED, FINE_SETTLED = 1e-3, 2e-4  # shift of a step of a fit that is the last [m]
+COARSE_SETTLED, FINE_SETTLED = 2e-3, 4e-4  # shift of a step of a fit that is the last [m]
 NORMALS = 100  # that are compared at most
 HIDDEN = 0.03  # share of the border beside an occluder from which on an end may be hidden
 

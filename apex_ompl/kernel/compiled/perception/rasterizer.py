@@ -50,6 +50,7 @@ def draw(vertices: Floats, faces: Integers, lens: Floats, depth: Floats, index: 
     """Draw triangles, see :func:`draw_triangles`."""
     height, width = depth.shape
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    across = 1.0 / fx
     for k in range(len(faces)):
         a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
         ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
@@ -84,7 +85,7 @@ def draw(vertices: Floats, faces: Integers, lens: Floats, depth: Floats, index: 
                 start, end = _inside(vx, vs, fx, cx, start, end)
                 start, end = _inside(wx, ws, fx, cx, start, end)
             for column in range(start, end + 1):
-                x = (column - cx) / fx
+                x = (column - cx) * across
                 u, v, w = ux * x + us, vx * x + vs, wx * x + ws
                 if u <= 0.0 and v <= 0.0 and w <= 0.0:
                     z = det / (u + v + w)

@@ -362,7 +362,9 @@ def _add_points(
     cost = 0.0
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        column, line = round(lens[0] * x / z + lens[2]), round(lens[1] * y / z + lens[3])
+        shrink = 1.0 / z
+        column = math.floor(lens[0] * x * shrink + lens[2] + 0.5)
+        line = math.floor(lens[1] * y * shrink + lens[3] + 0.5)
         inside = 0 <= line < height and 0 <= column < width
         k = index[line, column] if inside else -1
         seen = k >= 0
