@@ -224,12 +224,12 @@ def fit_surface(
     rotation, position, scale = start[:3, :3].copy(), start[:3, 3].copy(), np.ones(3)
     shape = beyond.shape
     depth, index, matrix, cross = np.empty(shape), np.empty(shape, np.int64), np.empty((n, n)), np.empty((n, POSE))
-    s = settings
+    s, most = settings, settings.steps if steps is None else steps
     numbers = s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach, s.settled
     cost = surface_fit.fit_surface(
         np.ascontiguousarray(points), len(points) if outline is None else outline, beyond, lens, vertices, faces,
         ties, symmetry, rotation, position, scale,
-        expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), s.steps if steps is None else steps,
+        expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), most,
         np.empty_like(vertices), depth, index, matrix, np.empty((n, n)), np.empty(n), cross, np.empty(n),
         np.empty(POSE),
     )  # fmt: skip

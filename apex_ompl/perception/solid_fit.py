@@ -151,9 +151,11 @@ def _misfit(found: _Found, patch: Patch) -> float:
 def _honest(one: Estimate, misfit: float, settings: ObstacleSettings) -> Estimate:
     """Return an estimate with the errors that do not average out, and those of a solid that does not explain points.
 
-    Errors of both ends of an axis are independent: half the variance of one end is the center's, twice that the length's.
+    Errors of both ends of an axis are independent: the center has half the variance of an end, the length twice that.
     """
-    unexplained = UNEXPLAINED * float(one.solid.size.max()) * min(1.0, max(0.0, misfit / settings.most_misfit - 1.0) / SUDDEN)
+    unexplained = (
+        UNEXPLAINED * float(one.solid.size.max()) * min(1.0, max(0.0, misfit / settings.most_misfit - 1.0) / SUDDEN)
+    )
     variance = settings.systematic**2 + unexplained**2
     more = np.diag(np.concatenate([np.zeros(3), np.full(3, variance / 2.0), 2.0 * variance / one.solid.size**2]))
     return Estimate(one.solid, one.covariance + more, misfit)
