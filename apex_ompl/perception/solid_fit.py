@@ -181,14 +181,14 @@ def _hypotheses(
 
 
 def _searched(patch: Patch, most_misfit: float) -> _Found | None:
-    """Return the best fit from all starts; those that were given up are tried where the others explain too little."""
+    """Return the best fit from all starts; those of the other kind are tried again where it explains too little."""
     found = [_run(one, patch.coarse, FIRST_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
     least = min((one.fit.cost for one in found), default=np.inf)
     if not np.isfinite(least):
         return None
     best = _refined([one for one in found if one.fit.cost < HOPELESS * least], patch)
     if best is None or _misfit(best, patch) > most_misfit:
-        other = _refined([one for one in found if HOPELESS * least <= one.fit.cost < np.inf], patch)
+        other = _refined([one for one in found if best is None or one.start.kind != best.start.kind], patch)
         best = min((one for one in (best, other) if one is not None), key=_cost, default=None)
     return None if best is None else min(best, _run(_grown(best.solid, GROWN), patch.fine, FINE_STEPS), key=_cost)
 
