@@ -156,7 +156,8 @@ class FitSettings:
         first: Residual from which points do not count at the first step [m].
         last: The same at the end [m].
         reach: The same of the contour [m].
-        steps: Number of steps.
+        steps: Number of steps at most.
+        settled: Shift, and a tenth of the turn [rad] and of the growth, of a step that is the last one [m].
     """
 
     noise: float
@@ -168,6 +169,7 @@ class FitSettings:
     last: float
     reach: float
     steps: int
+    settled: float = 0.0
 
 
 class SurfaceFit(NamedTuple):
@@ -198,6 +200,7 @@ class SurfaceFit(NamedTuple):
 def fit_surface(
     points: Array, beyond: Array, lens: Array, vertices: Array, faces: Integers, ties: Integers, symmetry: int,
     start: Array, expected: Array, prior: Array, settings: FitSettings, outline: int | None = None,
+    steps: int | None = None,
 ) -> SurfaceFit:  # fmt: skip
     """Fit the pose of a surface to points and to pixels that it must not cover.
 
@@ -215,17 +218,18 @@ def fit_surface(
             logarithms of the scales where these are unknown, shape (9, 9).
         settings: Weights and limits.
         outline: Points from this one on only have to be inside the outline; their depths are guessed.
+        steps: Number of steps at most where it is another than that of the settings.
     """
     n = len(prior)
     rotation, position, scale = start[:3, :3].copy(), start[:3, 3].copy(), np.ones(3)
     shape = beyond.shape
     depth, index, matrix, cross = np.empty(shape), np.empty(shape, np.int64), np.empty((n, n)), np.empty((n, POSE))
-    s = settings
-    numbers = s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach
+    s, most = settings, settings.steps if steps is None else steps
+    numbers = s.noise, s.floor, s.edge, s.point_share, s.contour_share, s.first, s.last, s.reach, s.settled
     cost = surface_fit.fit_surface(
         np.ascontiguousarray(points), len(points) if outline is None else outline, beyond, lens, vertices, faces,
         ties, symmetry, rotation, position, scale,
-        expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), s.steps,
+        expected[:3, :3].copy(), expected[:3, 3].copy(), prior, tuple(map(float, numbers)), most,
         np.empty_like(vertices), depth, index, matrix, np.empty((n, n)), np.empty(n), cross, np.empty(n),
         np.empty(POSE),
     )  # fmt: skip

@@ -5,6 +5,7 @@ The color is looked for in every second row and column first, and exactly around
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +19,7 @@ Mask = NDArray[np.bool_]
 
 APART = 0.04  # second difference of neighboring depths of different surfaces [m]
 BEFORE = 0.03  # by which an occluder is before an obstacle [m]
+JUST_BEFORE = 0.01  # the same of an occluder between two parts of one [m]
 PAD = 8  # around an obstacle's pixels [pixels]
 NEIGHBOR = 40  # pixels from a measured one within which pixels of the color belong to it
 FLYING = 3  # pixels from a measured one within which depths may be between both sides of an edge
@@ -65,6 +67,7 @@ class ColorPart(NamedTuple):
         filled: Depths, those of the nearest pixel that has one where it has none of its own, shape (h, w) [m].
         depth: Its mean depth [m].
         size: Number of pixels with depths that are sure.
+        pieces: Parts that an occluder may divide, of which it was put together; none for most.
     """
 
     left: int
@@ -74,6 +77,7 @@ class ColorPart(NamedTuple):
     filled: Array
     depth: float
     size: int
+    pieces: tuple[ColorPart, ...] = ()
 
 
 def color_parts(
@@ -94,23 +98,20 @@ def color_parts(
     coarse = color.pixels(cv.resize(image[: 2 * half[1], : 2 * half[0]], half, interpolation=cv.INTER_NEAREST)).astype(
         np.uint8
     )
-    count, labels, stats, _ = cv.connectedComponentsWithStats(coarse, connectivity=8)
+    contours, _ = cv.findContours(coarse, cv.RETR_EXTERNAL, cv.CHAIN_APPROX_NONE)
     parts = []
-    for k in range(1, count):
-        if 4 * stats[k, cv.CC_STAT_AREA] < least:
+    for contour in contours:
+        x, y, width, height = cv.boundingRect(contour)
+        if 4 * width * height < least or 4 * (cv.contourArea(contour) + len(contour) / 2.0 + 1.0) < least:
             continue
-        left, top = (2 * max(0, int(stats[k, axis]) - PAD // 2) for axis in (cv.CC_STAT_LEFT, cv.CC_STAT_TOP))
-        right = 2 * (int(stats[k, cv.CC_STAT_LEFT] + stats[k, cv.CC_STAT_WIDTH]) + PAD // 2)
-        bottom = 2 * (int(stats[k, cv.CC_STAT_TOP] + stats[k, cv.CC_STAT_HEIGHT]) + PAD // 2)
+        left, top = 2 * max(0, x - PAD // 2), 2 * max(0, y - PAD // 2)
+        right, bottom = 2 * (x + width + PAD // 2), 2 * (y + height + PAD // 2)
         crop = slice(top, bottom), slice(left, right)
-        near = cv.dilate(
-            (labels[top // 2 : bottom // 2, left // 2 : right // 2] == k).astype(np.uint8), np.ones((3, 3))
-        )
         shape = depth[crop].shape
-        near = near.repeat(2, axis=0).repeat(2, axis=1)[: shape[0], : shape[1]] > 0
-        own = np.zeros(shape, bool)
-        colored = _without_specks(color.pixels(image[crop]))
-        own[: near.shape[0], : near.shape[1]] = colored[: near.shape[0], : near.shape[1]] & near
+        filled = np.zeros(((shape[0] + 1) // 2, (shape[1] + 1) // 2), np.uint8)
+        cv.drawContours(filled, [contour], 0, 1, cv.FILLED, offset=(-(left // 2), -(top // 2)))
+        near = cv.dilate(filled, np.ones((3, 3), np.uint8)).repeat(2, axis=0).repeat(2, axis=1) > 0
+        own = _without_specks(color.pixels(image[crop])) & near[: shape[0], : shape[1]]
         parts += _connected(own, depth[crop], (left, top), noise=noise, least=least)
     return _merged(parts, depth, largest)
 
@@ -164,13 +165,14 @@ def _steps(depth: Array, limit: Array) -> Mask:
 
 def _merged(parts: list[ColorPart], depth: Array, largest: float) -> list[ColorPart]:
     """Return the parts, those of like depth with an occluder between them as one."""
-    found = list(parts)
-    k = 0
+    found, k = list(parts), 0
+    borders = {id(one): _border(one) for one in found} if len(found) > 1 else {}
     while k < len(found):
         for m in range(k + 1, len(found)):
             near = abs(found[k].depth - found[m].depth) < largest / 2.0
-            if near and _occluded_between(found[k], found[m], depth):
+            if near and _occluded_between(found[k], found[m], [borders[id(found[n])] for n in (k, m)], depth):
                 found[k] = _together(found[k], found.pop(m))
+                borders[id(found[k])] = _border(found[k])
                 break
         else:
             k += 1
@@ -193,12 +195,13 @@ def _together(first: ColorPart, second: ColorPart) -> ColorPart:
         maybe[rows, columns] |= one.maybe
     depth = (first.depth * first.size + second.depth * second.size) / size
     filled = np.where(filled > 0.0, filled, depth)
-    return ColorPart(left, top, own, maybe, filled, depth, size)
+    pieces = (*(first.pieces or (first,)), *(second.pieces or (second,)))
+    return ColorPart(left, top, own, maybe, filled, depth, size, pieces)
 
 
-def _occluded_between(first: ColorPart, second: ColorPart, depth: Array) -> bool:
+def _occluded_between(first: ColorPart, second: ColorPart, borders: Sequence[Indices], depth: Array) -> bool:
     """Return whether an occluder is at most pixels between the nearest pixels of two parts."""
-    a, b = _border(first), _border(second)
+    a, b = borders
     apart = ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=-1)
     i, j = np.unravel_index(int(np.argmin(apart)), apart.shape)
     count = max(2, int(np.sqrt(apart[i, j])))
@@ -207,7 +210,15 @@ def _occluded_between(first: ColorPart, second: ColorPart, depth: Array) -> bool
     if not len(line):
         return False
     between = depth[line[:, 0], line[:, 1]]
-    return bool(np.mean((between > 0.0) & (between < min(first.depth, second.depth) - BEFORE)) > 0.6)
+    ends = _depth_at(first, a[i]), _depth_at(second, b[j])
+    share = np.linalg.norm(line - a[i], axis=1) / np.linalg.norm(b[j] - a[i])
+    before = ends[0] + (ends[1] - ends[0]) * share - JUST_BEFORE
+    return bool(np.mean((between > 0.0) & (between < before)) > 0.6)
+
+
+def _depth_at(part: ColorPart, pixel: Indices) -> float:
+    """Return the depth of a part at a pixel of the image [m]."""
+    return float(part.filled[pixel[0] - part.top, pixel[1] - part.left])
 
 
 def _border(part: ColorPart) -> Indices:

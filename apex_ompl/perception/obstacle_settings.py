@@ -26,7 +26,11 @@ class ObstacleSettings:
         edge: Standard deviation of the contour [pixels].
         point_share: Independent measurements for each patch of pixels that share their noise.
         contour_share: Independent measurements for each pixel of the contour.
-        inflation: Factor of the variances of measurements.
+        tempering: Factor of the variances of measurements where hypotheses are compared.
+        inflation: The same in covariances.
+        systematic: Standard deviation of each end that does not average out over pixels [m].
+        most_misfit: Mean squared error of points over that of noise above which one solid does not explain them; the
+            covariance grows to the size of the obstacle.
         most_points: Points that are used at most.
         cubes: Share of boxes that are cubes.
     """
@@ -44,7 +48,10 @@ class ObstacleSettings:
     edge: float = 0.5
     point_share: float = 1.4
     contour_share: float = 0.3
-    inflation: float = 3.2
+    tempering: float = 3.2
+    inflation: float = 1.4
+    systematic: float = 0.0003
+    most_misfit: float = 1.35
     most_points: int = 300
     cubes: float = 0.2
 
@@ -61,7 +68,7 @@ class ObstacleSettings:
         check_number(self.cubes, "cubes", 0.0, 0.999)
         for name in ("smallest", "largest", "least_points", "floor", "edge", "point_share", "contour_share"):
             check_positive(getattr(self, name), name)
-        for name in ("inflation", "most_points"):
+        for name in ("tempering", "inflation", "systematic", "most_misfit", "most_points"):
             check_positive(getattr(self, name), name)
         if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
             raise ParameterError("high", self.high, f"numbers above those of low, {self.low}")

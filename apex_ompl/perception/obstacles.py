@@ -129,12 +129,16 @@ class ObstacleFinder:
         """
         s = self.settings
         image = resampled(color, undistorted(seen.camera))
-        found = []
-        for part in self._parts(image, seen):
+        found, parts = [], self._parts(image, seen)
+        while parts:
+            part = parts.pop()
             patch = patch_of(part, seen, s)
             if patch is None or not self._wanted(patch, seen, others):
                 continue
             estimate = fitted(patch, seen, s, known)
+            if part.pieces and (estimate is None or estimate.misfit > s.most_misfit):
+                parts += part.pieces  # they are no single obstacle
+                continue
             answer = None if estimate is None else _answer(estimate, patch, seen)
             if answer is not None and self._sized(answer):
                 found.append(answer)

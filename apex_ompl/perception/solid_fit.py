@@ -28,22 +28,26 @@ from apex_ompl.scene.bodies import Body
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_positive, finite_array
 
-COARSE_STEPS, PROFILE_STEPS = 5, 3
-RIVALS, RIVAL = 3, 1.3  # fits that are refined at most, and their largest cost over the least
+FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 2, 4, 2
+HOPELESS = 2.2  # cost over the least, after the first steps, from which a start is given up
+RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
+GROWN = 1.06  # ratio of lengths of a last start to those of the best fit, which may be too short
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
 SAME_PLACE, SAME_SIZE = 0.004, 0.05  # differences of fits that are the same [m], of logarithms of lengths
 STEP = 0.22  # of the logarithm of a length from one of the mixture to the next
 UNLIKELY, MOST_LENGTHS = 14.0, 8  # cost above the least where lengths of the mixture end, and their number
 SHARP = 0.09  # standard deviation of the logarithm of a length below which it has no mixture
-VAGUE = 0.06  # standard deviation of the logarithm of a length above which it has a mixture of its own
+VAGUE = 0.04  # standard deviation of the logarithm of a length above which it has a mixture of its own
 KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
-MISFIT = 1.5  # mean squared error of points over that of noise above which covariances grow
+UNEXPLAINED = 0.4  # standard deviation of ends of what one solid does not explain, over its largest length
+SUDDEN = 0.3  # relative increase of the misfit over which that spread comes
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
 LONGER = 1.3  # ratio of lengths that tells whether one is
 NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
 NOT_SQUARE = 0.06  # logarithm of the ratio of sides from which on a box is no cube, beside the errors
 SLICES = 32
+TIES = {"box": np.array([0, 1, 2]), "cylinder": np.array([0, 0, 2])}  # unknown of the length along each axis
 ORDERS = tuple(permutations(range(3)))  # of known lengths along the axes of a box
 
 
@@ -78,10 +82,17 @@ class KnownSize:
 
 
 class Estimate(NamedTuple):
-    """A solid with the covariance of turn, shift and logarithms of lengths in the optical frame, shape (9, 9)."""
+    """A solid that was fitted, in the optical frame.
+
+    Attributes:
+        solid: The solid.
+        covariance: Of turn, shift and logarithms of lengths, shape (9, 9).
+        misfit: Mean squared error of points over that of noise.
+    """
 
     solid: Solid
     covariance: Array
+    misfit: float = 1.0
 
 
 class _Found(NamedTuple):
@@ -117,55 +128,95 @@ def fitted(
         settings: How much measurements say.
         known: Sizes that it may have, or others.
     """
-    best = _searched(patch)
+    best = _searched(patch, settings.most_misfit)
     if best is None:
         return None
-    misfit = max(1.0, best.fit.cost / (patch.fine.settings.point_share * patch.fine.measured) / MISFIT)
+    factor, misfit = settings.inflation / settings.tempering, _misfit(best, patch)
     sized = _of_known_size(best, patch, known)
     if sized is not None:
-        return _estimate(sized, misfit, seen)
-    parts = _hypotheses(best, misfit, patch, seen, settings)
+        return _honest(_estimate(sized, factor, seen), _misfit(sized, patch), settings)
+    parts = _hypotheses(best, factor, patch, seen, settings)
     if best.start.kind == "box" and settings.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
         parts = [(one + float(np.log(1.0 - settings.cubes)), solid) for one, solid in parts]
-        parts.append((cube.evidence + float(np.log(settings.cubes)), _estimate(cube, misfit, seen)))
-    return mixture(parts)
+        parts.append((cube.evidence + float(np.log(settings.cubes)), _estimate(cube, factor, seen)))
+    return _honest(mixture(parts), misfit, settings)
+
+
+def _misfit(found: _Found, patch: Patch) -> float:
+    """Return the mean squared error of points over that of noise."""
+    return float(found.fit.cost / (patch.fine.settings.point_share * patch.fine.measured))
+
+
+def _honest(one: Estimate, misfit: float, settings: ObstacleSettings) -> Estimate:
+    """Return an estimate with the errors that do not average out, and those of a solid that does not explain points.
+
+    Errors of both ends of an axis are independent: the center has half the variance of an end, the length twice that.
+    """
+    unexplained = (
+        UNEXPLAINED * float(one.solid.size.max()) * min(1.0, max(0.0, misfit / settings.most_misfit - 1.0) / SUDDEN)
+    )
+    variance = settings.systematic**2 + unexplained**2
+    more = np.diag(np.concatenate([np.zeros(3), np.full(3, variance / 2.0), 2.0 * variance / one.solid.size**2]))
+    return Estimate(one.solid, one.covariance + more, misfit)
 
 
 def _hypotheses(
-    best: _Found, misfit: float, patch: Patch, seen: CorrectedFrame, settings: ObstacleSettings
+    best: _Found, factor: float, patch: Patch, seen: CorrectedFrame, settings: ObstacleSettings
 ) -> list[tuple[float, Estimate]]:  # fmt: skip
     """Return estimates of different lengths along the axis that is known least, with logarithms of their evidence."""
-    alone = _estimate(best, misfit, seen)
+    alone = _estimate(best, factor, seen)
     end = _hidden_end(best, patch) if patch.hidden else None
     axis, side = end if end is not None else (_vague_axis(alone), 0.0)
     if axis is None:
         return [(best.evidence, alone)]
     held, deviation = _profile(best, axis, side, patch, settings)
     if len(held) < 2 or deviation <= SHARP:
-        more = misfit * deviation**2 - alone.covariance[6 + axis, 6 + axis]
+        more = factor * deviation**2 - alone.covariance[6 + axis, 6 + axis]
         return [(best.evidence, _spread(alone, axis, max(0.0, more)))]
     lengths = best.solid.size if end is not None else np.delete(best.solid.size, axis)
     odds = _odds(held, axis, float(np.log(lengths[axis] if end is not None else lengths).mean()))
     likely = [k for k, one in enumerate(odds) if one > max(odds) - NEGLIGIBLE]
-    return [(odds[k], _spread(_estimate(held[k], misfit, seen), axis, STEP**2 / 12.0, side)) for k in likely]
+    return [(odds[k], _spread(_estimate(held[k], factor, seen), axis, STEP**2 / 12.0, side)) for k in likely]
 
 
-def _searched(patch: Patch) -> _Found | None:
-    """Return the best fit from all starts."""
-    found = [_run(one, patch.coarse, COARSE_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
-    found = sorted((one for one in found if np.isfinite(one.fit.cost)), key=lambda one: one.fit.cost)
-    if not found:
+def _searched(patch: Patch, most_misfit: float) -> _Found | None:
+    """Return the best fit from all starts; those of the other kind are tried again where it explains too little."""
+    found = [_run(one, patch.coarse, FIRST_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
+    least = min((one.fit.cost for one in found), default=np.inf)
+    if not np.isfinite(least):
         return None
+    best = _refined([one for one in found if one.fit.cost < HOPELESS * least], patch)
+    if best is None or _misfit(best, patch) > most_misfit:
+        other = _refined([one for one in found if best is None or one.start.kind != best.start.kind], patch)
+        best = min((one for one in (best, other) if one is not None), key=_cost, default=None)
+    return None if best is None else min(best, _run(_grown(best.solid, GROWN), patch.fine, FINE_STEPS), key=_cost)
+
+
+def _refined(found: Sequence[_Found], patch: Patch) -> _Found | None:
+    """Return the best of fits after more steps, the likely ones at full resolution."""
+    late = patch.coarse._replace(settings=replace(patch.coarse.settings, first=patch.coarse.settings.last))
+    found = sorted((_run(one.solid, late, COARSE_STEPS) for one in found), key=_cost)
     rivals: list[_Found] = []
     for one in found:
-        if one.fit.cost > RIVAL * found[0].fit.cost or len(rivals) == RIVALS:
+        if not one.fit.cost <= RIVAL * found[0].fit.cost or len(rivals) == RIVALS:
             break
         if not any(_alike(one.solid, other.solid) for other in rivals):
             rivals.append(one)
-    refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals]
-    refined = [one for one in refined if np.isfinite(one.fit.cost)]
-    return min(refined, key=lambda one: one.fit.cost) if refined else None
+    refined = [_run(one.solid, patch.fine, FINE_STEPS) for one in rivals if np.isfinite(one.fit.cost)]
+    return min((one for one in refined if np.isfinite(one.fit.cost)), key=_cost, default=None)
+
+
+def _cost(one: _Found) -> float:
+    """Return the cost of a fit."""
+    return one.fit.cost
+
+
+def _grown(solid: Solid, ratio: float) -> Solid:
+    """Return a solid whose lengths are larger by a ratio, and whose near ends stay."""
+    for axis in range(3) if solid.kind == "box" else (0, 2):
+        solid = resized(solid, axis, ratio * float(solid.size[axis]))
+    return solid
 
 
 def _alike(first: Solid, second: Solid) -> bool:
@@ -181,17 +232,18 @@ def _run(
     """Return the fit from a start."""
     surface = _unit(start.kind)
     symmetry = 0 if start.kind == "box" else AXIS
-    tied = np.array(ties if ties is not None else (0, 1, 2) if start.kind == "box" else (0, 0, 2))
+    tied = TIES[start.kind] if ties is None else np.array(ties)
     before = _prior(start.kind) if prior is None else prior
     fit = fit_surface(
         level.points, level.beyond, level.lens, surface.vertices * start.size, surface.faces, tied, symmetry,
-        start.pose, start.pose, before, replace(level.settings, steps=steps), level.measured,
+        start.pose, start.pose, before, level.settings, level.measured, steps,
     )  # fmt: skip
     return _Found(start, fit, before, [*range(6), *(6 + tied)])
 
 
+@cache
 def _prior(kind: Kind) -> Array:
-    """Return the information before a fit, shape (9, 9)."""
+    """Return the information before a fit, shape (9, 9), which is not to be changed."""
     prior = np.diag([TURN**-2] * 3 + [PLACE**-2] * 3 + [SIZE**-2] * 3)
     if kind == "cylinder":  # both diameters are one unknown
         prior[7, 7] = KNOWN
@@ -286,7 +338,7 @@ def _hidden_end(best: _Found, patch: Patch) -> tuple[int, float] | None:
 
 def _held(start: Solid, axis: int, level: Level) -> _Found:
     """Return the fit with a length that is held."""
-    prior = _prior(start.kind)
+    prior = _prior(start.kind).copy()
     prior[6 + axis, 6 + axis] = HELD
     return _run(start, level, PROFILE_STEPS, prior)
 
@@ -335,7 +387,7 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
             start = best.solid
             for axis in range(3):
                 start = resized(start, axis, float(size[axis]))
-            prior = _prior(one.kind)
+            prior = _prior(one.kind).copy()
             for axis in range(3) if one.kind == "box" else (0, 2):
                 prior[6 + axis, 6 + axis] = (size[axis] / one.spread) ** 2
             coarse = _run(start, patch.coarse, PROFILE_STEPS, prior)
@@ -351,6 +403,8 @@ def _of_known_size(best: _Found, patch: Patch, known: Sequence[KnownSize]) -> _F
 
 def mixture(parts: Sequence[tuple[float, Estimate]]) -> Estimate:
     """Return the mean and the covariance of hypotheses, one or more; turns are those of the most likely one."""
+    if len(parts) == 1:
+        return parts[0][1]
     evidence = np.array([one for one, _ in parts])
     parts = [one for one, value in zip(parts, evidence, strict=True) if value > evidence.max() - NEGLIGIBLE]
     evidence = np.array([one for one, _ in parts])

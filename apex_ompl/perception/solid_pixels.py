@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +20,12 @@ from apex_ompl.types import Array, Indices
 Mask = NDArray[np.bool_]
 
 COARSE, FINE = 45, 90  # width or height of windows [pixels]
-COARSE_POINTS = 120
+COARSE_POINTS = 80
 COARSE_GUESSED, FINE_GUESSED = 250, 800  # points at the border that are used at most
-FINE_STEPS = 5  # of a fit
-NORMALS = 150  # that are compared at most
+FINE_STEPS = 5  # of a fit at most
+FIRST, LAST = 0.04, 0.02  # residual from which points do not count at the first step of a search, and later [m]
+COARSE_SETTLED, FINE_SETTLED = 2e-3, 4e-4  # shift of a step of a fit that is the last [m]
+NORMALS = 100  # that are compared at most
 HIDDEN = 0.03  # share of the border beside an occluder from which on an end may be hidden
 
 
@@ -98,7 +101,7 @@ def patch_of(part: ColorPart, seen: CorrectedFrame, settings: ObstacleSettings) 
     hidden = np.count_nonzero(border & occluder) > HIDDEN * np.count_nonzero(border)
     lens = lens_of(camera)
 
-    def level(size: int, most: int, most_guessed: int) -> tuple[Level, Array]:
+    def level(size: int, most: int, most_guessed: int, first: float, settled: float) -> tuple[Level, Array]:
         stride = -(-max(own.shape) // size)
         height, width = own.shape[0] // stride, own.shape[1] // stride
         window = Window(int(corner[1]), int(corner[0]), width, height, stride)
@@ -109,11 +112,12 @@ def patch_of(part: ColorPart, seen: CorrectedFrame, settings: ObstacleSettings) 
         points, guessed = _points(guess[cells], good, own_lens), _points(guess[cells], all_good & ~good, own_lens)
         kept = points[_spaced(len(points), most)]
         own_settings = _fit_settings(settings, stride, len(points) / max(len(kept), 1), seen)
+        own_settings = replace(own_settings, first=first, settled=settled)
         every = np.concatenate([kept, guessed[_spaced(len(guessed), most_guessed)]])
         return Level(window, every, len(kept), beyond, own_lens, own_settings), np.concatenate([points, guessed])
 
-    fine, _ = level(FINE, settings.most_points, FINE_GUESSED)
-    coarse, extent = level(COARSE, COARSE_POINTS, COARSE_GUESSED)
+    fine, _ = level(FINE, settings.most_points, FINE_GUESSED, LAST, FINE_SETTLED)
+    coarse, extent = level(COARSE, COARSE_POINTS, COARSE_GUESSED, FIRST, COARSE_SETTLED)
     stride = coarse.window.stride
     grid = _grid(guess[::stride, ::stride], Window(corner[1], corner[0], 0, 0, stride).lens(lens))
     places, normals = _normals(grid, measured[::stride, ::stride])
@@ -124,8 +128,8 @@ def _fit_settings(settings: ObstacleSettings, stride: int, thinning: float, seen
     shared = max(1.0, (seen.camera.depth.correlation / stride) ** 2)
     return FitSettings(
         noise=seen.noise, floor=settings.floor, edge=settings.edge,
-        point_share=settings.point_share * thinning / shared / settings.inflation,
-        contour_share=settings.contour_share * stride / settings.inflation, first=0.04, last=0.02, reach=0.02,
+        point_share=settings.point_share * thinning / shared / settings.tempering,
+        contour_share=settings.contour_share * stride / settings.tempering, first=FIRST, last=LAST, reach=0.02,
         steps=FINE_STEPS,
     )  # fmt: skip
 

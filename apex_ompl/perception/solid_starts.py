@@ -16,6 +16,7 @@ from apex_ompl.types import Array
 Kind = Literal["box", "cylinder"]
 
 SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
+SAME_AXIS = np.cos(np.radians(10.0))  # of cylinders
 SQUARE = 0.5  # cosine between normals of different sides
 THICK = 0.012  # distance from a plane of its points [m]
 THIN, THICK_SHARE = 0.35, 0.8  # shares of the width of what may be the depth of a box, and of what surely is
@@ -46,7 +47,7 @@ def _plane(places: Array, normals: Array) -> Array | None:
     if not len(normals):
         return None
     alike = normals @ normals.T > SAME_WAY
-    group = alike[int(np.argmax(alike.sum(axis=1)))]
+    group = alike[int(np.argmax(alike @ np.ones(len(normals))))]
     mean = normals[group].mean(axis=0)
     mean /= np.sqrt(mean @ mean)
     for _ in range(2):
@@ -96,9 +97,9 @@ def starts(extent: Array, places: Array, normals: Array) -> list[Solid]:
         frames += [_turned(frames[0], np.pi / 4.0), _squared(extent, first)]
     boxes = [one for frame in frames for one in _boxes(frame, extent)]
     axes = [first] if second is None else [first, second]
-    round_one = _round_axis(normals)
-    if round_one is not None:
-        axes.append(round_one)
+    for one in (_round_axis(normals), frames[0][:, 1]):
+        if one is not None and all(abs(one @ axis) < SAME_AXIS for axis in axes):
+            axes.append(one)
     return boxes + [one for axis in axes for one in _cylinders(axis, extent)]
 
 
@@ -132,8 +133,7 @@ def _squared(points: Array, normal: Array) -> Array:
 
 def _boxes(frame: Array, extent: Array) -> list[Solid]:
     """Return a box of the points' extents and, where it is flat, one that is as deep as it is wide."""
-    along = extent @ frame
-    low, high = _extent(along)
+    low, high = _extent(extent, frame)
     solid = _solid("box", np.maximum(high - low, 0.01), frame, (high + low) / 2.0)
     share = solid.size[0] / solid.size[1:].mean()
     return ([solid] if share > THIN else []) + ([_deep(solid, 0)] if share < THICK_SHARE else [])
@@ -144,11 +144,12 @@ def _middle(values: Array) -> float:
     return float(np.partition(values, len(values) // 2)[len(values) // 2])
 
 
-def _extent(along: Array) -> tuple[Array, Array]:
-    """Return the first and the last percentile of each column."""
-    skipped, last = len(along) // 100, len(along) - 1
-    order = np.partition(along, (skipped, last - skipped), axis=0)
-    return order[skipped], order[last - skipped]
+def _extent(points: Array, frame: Array) -> tuple[Array, Array]:
+    """Return the first and the last percentile of points along each axis of a frame."""
+    along = np.ascontiguousarray(frame.T @ points.T)
+    skipped, last = along.shape[1] // 100, along.shape[1] - 1
+    order = np.partition(along, (skipped, last - skipped), axis=1)
+    return order[:, skipped], order[:, last - skipped]
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -178,8 +179,7 @@ def _cylinders(axis: Array, points: Array) -> list[Solid]:
         across = _longest(points, axis)
     across /= np.sqrt(across @ across)
     frame = np.stack([across, _cross(axis, across), axis], axis=1)
-    along = points @ frame
-    low, high = _extent(along)
+    low, high = _extent(points, frame)
     size, middle = np.maximum(high - low, 0.01), (high + low) / 2.0
     away = frame.T @ sight
     radius = float(size[0]) / 2.0

@@ -101,6 +101,32 @@ def test_a_bar_before_an_obstacle_does_not_divide_it() -> None:
     np.testing.assert_allclose(np.sort(found[0].size), np.sort(size), atol=0.03)
 
 
+def test_obstacles_beside_an_occluder_are_no_single_one() -> None:
+    """The bar hides what is between them; one solid does not explain both."""
+    first, second = placed(0.3, -0.11, 0.3, (0.0, 0.0, 0.5)), placed(0.42, 0.1, 0.28, (0.3, 0.0, 0.2))
+    middle = (first + second)[:3, 3] / 2.0
+    bar = solid_part(coal.Box(0.02, 0.05, 0.4), placed(*(middle + 0.4 * (EYE[:3, 3] - middle))), 7, GRAY)
+    cubes = [solid_part(coal.Box(0.12, 0.12, 0.12), pose, 5 + k, RED) for k, pose in enumerate((first, second))]
+    found = found_in([*cubes, bar])
+    assert len(found) == 2
+    for pose in (first, second):
+        assert min(np.linalg.norm(one.pose[:3, 3] - pose[:3, 3]) for one in found) < 0.02
+
+
+def test_what_one_solid_does_not_explain_is_not_known() -> None:
+    """Two boxes that touch are one part of the image."""
+    pose = placed(0.3, 0.0, 0.3)
+    upper, right = pose.copy(), pose.copy()
+    upper[2, 3] += 0.12
+    right[1, 3] += 0.12
+    parts = [solid_part(coal.Box(0.12, 0.12, 0.12), one, 5, RED) for one in (pose, upper, right)]
+    (whole,) = found_in(parts[:1])
+    (found,) = found_in(parts)
+    assert whole.place_spread < 0.005
+    assert found.place_spread > 0.05
+    assert (np.sqrt(found.covariance.diagonal()[6:]) > 0.05).all()
+
+
 def test_what_the_image_cuts_and_what_is_too_large_or_elsewhere() -> None:
     (cut,) = found_in([solid_part(coal.Box(0.2, 0.2, 0.2), placed(0.3, 0.5, 0.3), 5, RED)])
     assert cut.cut

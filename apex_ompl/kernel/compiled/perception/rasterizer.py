@@ -13,6 +13,7 @@ from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers
 
 NEAR = 0.02  # depth below which nothing is drawn [m]
+NARROW = 6  # columns up to which all pixels of a row are tested
 EDGE_ON = 1e-15  # determinant of a triangle seen from its edge [m^3]
 
 
@@ -34,10 +35,22 @@ def place_vertices(vertices: Floats, part: Integers, poses: Floats, placed: Floa
 
 
 @inlined
+def _inside(slope: float, offset: float, fx: float, cx: float, start: int, end: int) -> tuple[int, int]:
+    """Return the columns, and one beside them, where slope (column - cx) / fx + offset is not positive."""
+    if slope == 0.0:
+        return start, end
+    border = min(max(cx - fx * offset / slope, start - 1.0), end + 1.0)
+    if slope > 0.0:
+        return start, min(end, int(math.floor(border)) + 1)
+    return max(start, int(math.ceil(border)) - 1), end
+
+
+@inlined
 def draw(vertices: Floats, faces: Integers, lens: Floats, depth: Floats, index: Integers) -> None:
     """Draw triangles, see :func:`draw_triangles`."""
     height, width = depth.shape
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    across = 1.0 / fx
     for k in range(len(faces)):
         a, b, c = faces[k, 0], faces[k, 1], faces[k, 2]
         ax, ay, az = vertices[a, 0], vertices[a, 1], vertices[a, 2]
@@ -66,8 +79,13 @@ def draw(vertices: Floats, faces: Integers, lens: Floats, depth: Floats, index: 
         for row in range(top, bottom + 1):
             y = (row - cy) / fy
             us, vs, ws = uy * y + uz, vy * y + vz, wy * y + wz
-            for column in range(left, right + 1):
-                x = (column - cx) / fx
+            start, end = left, right
+            if right - left > NARROW:
+                start, end = _inside(ux, us, fx, cx, start, end)
+                start, end = _inside(vx, vs, fx, cx, start, end)
+                start, end = _inside(wx, ws, fx, cx, start, end)
+            for column in range(start, end + 1):
+                x = (column - cx) * across
                 u, v, w = ux * x + us, vx * x + vs, wx * x + ws
                 if u <= 0.0 and v <= 0.0 and w <= 0.0:
                     z = det / (u + v + w)

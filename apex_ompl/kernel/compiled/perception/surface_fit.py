@@ -22,6 +22,7 @@ REACH = 8  # pixels beside a drawing within which points belong to it
 DIAGONAL = math.sqrt(2.0)
 LARGEST_TURN = 0.3  # of a step [rad]
 LARGEST_GROWTH = 0.15  # of the logarithm of a length in a step
+SETTLED_TURN = 10.0  # turn, and logarithm of a length, for each meter of the shift that is the last step's [1/m]
 
 
 @entry_point
@@ -232,7 +233,7 @@ def fit_surface(
     points: Floats, outline: int, beyond: Floats, lens: Floats, vertices: Floats, faces: Integers, ties: Integers,
     symmetry: int, rotation: Floats, position: Floats, scale: Floats, prior_rotation: Floats, prior_position: Floats,
     prior: Floats,
-    settings: tuple[float, float, float, float, float, float, float, float], steps: int,
+    settings: tuple[float, float, float, float, float, float, float, float, float], steps: int,
     placed: Floats, depth: Floats, index: Integers, matrix: Floats, factor: Floats, vector: Floats, cross: Floats,
     row: Floats, camera: Floats,
 ) -> float:  # fmt: skip
@@ -256,9 +257,9 @@ def fit_surface(
         prior: Information of turn and shift from there, and of logarithms of the scales, shape (n, n); scales are
             unknown where n is 9, and known where it is 6.
         settings: Noise of depth z over z^2 [1/m], error of surfaces [m], error of the contour [pixels], information of
-            a point and of a pixel of the contour, largest residual at the start and in the end [m], and that of the
-            contour [m].
-        steps: Number of steps.
+            a point and of a pixel of the contour, largest residual at the start and in the end [m], that of the
+            contour [m], and shift of a step that is the last [m].
+        steps: Number of steps at most.
         placed: Room, shape (V, 3).
         depth: Room, shape (h, w); has the surface at its pose in the end [m].
         index: Room, shape (h, w); has the triangles seen, or -1.
@@ -271,7 +272,9 @@ def fit_surface(
     """
     cost = math.inf
     first, last = settings[5], settings[6]
+    settled = False
     for step in range(steps + 1):
+        final = settled or step == steps
         _place(vertices, rotation, position, scale, placed)
         for i in range(index.shape[0]):
             for j in range(index.shape[1]):
@@ -282,17 +285,17 @@ def fit_surface(
             vector[k] = 0.0
             for m in range(CAMERA):
                 cross[k, m] = 0.0
-        cutoff = max(last, first * 0.7**step) if step < steps else last
+        cutoff = last if final else max(last, first * 0.7**step)
         cost = _add_points(
             points, outline, lens, faces, ties, symmetry, rotation, position, settings, cutoff, placed, depth, index,
-            matrix, vector, cross, row, camera, step == steps,
+            matrix, vector, cross, row, camera, final,
         )  # fmt: skip
         cost += _add_contour(
             beyond, outline < len(points), lens, ties, symmetry, rotation, position, settings, depth, index, matrix,
-            vector, cross, row, camera, step == steps,
+            vector, cross, row, camera, final,
         )  # fmt: skip
         cost += _add_prior(matrix, vector, prior, rotation, position, scale, ties, prior_rotation, prior_position, row)
-        if step == steps:
+        if final:
             for k in range(len(vector)):
                 for m in range(k):
                     matrix[m, k] = matrix[k, m]
@@ -301,7 +304,17 @@ def fit_surface(
         if not _solve(factor, vector):
             return math.inf
         _move(vector, rotation, position, scale, ties)
+        settled = cutoff == last and _settled(vector, settings[8])
     return cost
+
+
+@inlined
+def _settled(step: Floats, shift: float) -> bool:
+    """Return whether a step is below that which is the last one's [m]."""
+    for k in range(len(step)):
+        if not abs(step[k]) < (shift if 3 <= k < 6 else SETTLED_TURN * shift):
+            return False
+    return True
 
 
 @inlined
@@ -339,17 +352,19 @@ def _move(step: Floats, rotation: Floats, position: Floats, scale: Floats, ties:
 @outlined
 def _add_points(
     points: Floats, outline: int, lens: Floats, faces: Integers, ties: Integers, symmetry: int, rotation: Floats,
-    position: Floats, settings: tuple[float, float, float, float, float, float, float, float], cutoff: float,
+    position: Floats, settings: tuple[float, float, float, float, float, float, float, float, float], cutoff: float,
     placed: Floats, depth: Floats, index: Integers, matrix: Floats, vector: Floats, cross: Floats, row: Floats,
     camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residuals of points from the drawn surface to the normal equations, and return their cost."""
-    noise, floor, edge, point_share, contour_share, _, last, reach = settings
+    noise, floor, edge, point_share, contour_share, _, last, reach, _ = settings
     height, width = index.shape
     cost = 0.0
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]
-        column, line = round(lens[0] * x / z + lens[2]), round(lens[1] * y / z + lens[3])
+        shrink = 1.0 / z
+        column = math.floor(lens[0] * x * shrink + lens[2] + 0.5)
+        line = math.floor(lens[1] * y * shrink + lens[3] + 0.5)
         inside = 0 <= line < height and 0 <= column < width
         k = index[line, column] if inside else -1
         seen = k >= 0
@@ -398,14 +413,14 @@ def _add_points(
 @inlined
 def _add_uncovered(
     i: int, j: int, down: int, right: int, apart: float, lens: Floats, ties: Integers, symmetry: int, rotation: Floats,
-    position: Floats, settings: tuple[float, float, float, float, float, float, float, float], largest: float,
+    position: Floats, settings: tuple[float, float, float, float, float, float, float, float, float], largest: float,
     depth: Floats, matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residual of a pixel of the object that the drawing does not cover, and return its cost.
 
     The drawn pixel (i, j) is the nearest, and has to move towards that pixel in the image.
     """
-    _, floor, edge, _, share, _, _, _ = settings
+    _, floor, edge, _, share, _, _, _, _ = settings
     z = depth[i, j]
     x, y = (j - lens[2]) / lens[0] * z, (i - lens[3]) / lens[1] * z
     pixel = z / lens[0]
@@ -435,14 +450,14 @@ def _contour_row(
 @outlined
 def _add_contour(
     beyond: Floats, known: bool, lens: Floats, ties: Integers, symmetry: int, rotation: Floats, position: Floats,
-    settings: tuple[float, float, float, float, float, float, float, float], depth: Floats, index: Integers,
+    settings: tuple[float, float, float, float, float, float, float, float, float], depth: Floats, index: Integers,
     matrix: Floats, vector: Floats, cross: Floats, row: Floats, camera: Floats, final: bool,
 ) -> float:  # fmt: skip
     """Add the residuals of the drawing's contour from what may be covered, and return their cost.
 
     Where the outline is known, parts of the contour that agree with it and the border of the window count, too.
     """
-    _, floor, edge, _, share, _, _, reach = settings
+    _, floor, edge, _, share, _, _, reach, _ = settings
     height, width = index.shape
     cost = 0.0
     for i in range(1, height - 1):
