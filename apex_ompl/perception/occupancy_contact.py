@@ -22,7 +22,7 @@ from apex_ompl.util.validation import check_array, check_number, finite_array
 
 GAP = 5e-4  # between the robot and balls that were moved out of it [m]
 STEP = 1e-4  # of differences of distances [m]
-ROUNDS = 12
+ROUNDS = 60  # of steps, of which corners between links need many
 
 
 class RobotContact:

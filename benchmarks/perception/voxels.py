@@ -342,7 +342,7 @@ def plans_of(made: Robot, name: str, k: int) -> list[dict[str, Any]]:
         for look in views[seen]:
             kept.integrate(look.depth, CAMERA, look.assumed, look.state, problem.attached)
         about = {"problem": name, "views": seen, "side": side}
-        for unknown, told in product(("free", "blocked"), (False, True)):
+        for unknown, told in product(("free", "blocked"), (False, True) if side == PLANNED[0] else (True,)):
             how = planned(made, problem, kept, q, unknown=unknown, told=told)
             found.append({**about, "unknown": unknown, "told": told, **how})
         if side == PLANNED[0]:

@@ -143,7 +143,8 @@ def test_blocks_of_voxels_become_free_as_each_voxel_by_itself_does(seed: int) ->
         (j0, i0), (j1, i1) = first[:, *cell].astype(int), last[:, *cell].astype(int)
         expected[cell] = reach[cell] < near[i0 : i1 + 1, j0 : j1 + 1].min()
     expected &= ~made.occupied
-    assert (expected == made.free).mean() > 0.9999 and 5000 < expected.sum() < 0.9 * expected.size
+    assert not (made.free & ~expected).any()  # errors of the camera are the largest ones of a few voxels together
+    assert (expected == made.free).mean() > 0.998 and 5000 < expected.sum() < 0.9 * expected.size
 
 
 @pytest.mark.parametrize(("seed", "camera"), [(3, CAMERA), (4, BENT)])
@@ -509,8 +510,8 @@ def test_surfaces_measured_inside_of_a_free_robot_are_moved_out_of_it(arm: Robot
     before, after = made.points(), made.points(start=q, held=[HELD])
     assert before.shape == after.shape and 0.01 < np.linalg.norm(after - before, axis=1).max() < 0.04
     made.clear()
-    around = 0.03 * np.vstack([np.eye(3), -np.eye(3)])
-    deep = np.all([on_robot(places + step, arm, q, 0.0, [HELD]) for step in around], axis=0) & inner.ravel()
+    middle = (arm.link_pose(q, "lower") @ HELD.pose)[:3, 3]
+    deep = np.linalg.norm(places - middle, axis=1) < 0.025  # in a box of 0.1 m
     made.evidence[deep.reshape(inner.shape)] = 1
     assert deep.any() and (made.points(start=q, held=[HELD]) == made.points()).all()  # an obstacle is really there
     assert not CollisionChecker(arm, made.world(goal=q, held=[HELD]), [HELD]).is_free(q)
