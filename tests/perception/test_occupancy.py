@@ -143,8 +143,7 @@ def test_blocks_of_voxels_become_free_as_each_voxel_by_itself_does(seed: int) ->
         (j0, i0), (j1, i1) = first[:, *cell].astype(int), last[:, *cell].astype(int)
         expected[cell] = reach[cell] < near[i0 : i1 + 1, j0 : j1 + 1].min()
     expected &= ~made.occupied
-    assert not (made.free & ~expected).any()  # errors of the camera are the largest ones of a few voxels together
-    assert (expected == made.free).mean() > 0.998 and 5000 < expected.sum() < 0.9 * expected.size
+    assert (expected == made.free).mean() > 0.9999 and 5000 < expected.sum() < 0.9 * expected.size
 
 
 @pytest.mark.parametrize(("seed", "camera"), [(3, CAMERA), (4, BENT)])

@@ -203,65 +203,56 @@ def _seen_through(near: Singles, center: Spans, half: float, lens: Floats) -> bo
 
 
 @inlined
-def _margins(lens: Floats, x: float, y: float, z: float, spans: Spans) -> tuple[float, float, float]:
-    """Return by what the voxels of a box at x, y, z can be off in the image [cells], and a factor of their depths."""
-    shift = lens[8]
-    low, high = 1.0 / (z - spans[2] - shift), 1.0 / (z + spans[2] + shift)
-    u0, u1 = _quotients(x, spans[0] + shift, low, high)
-    v0, v1 = _quotients(y, spans[1] + shift, low, high)
-    widest, highest = max(abs(u0), abs(u1)), max(abs(v0), abs(v1))
-    turn = lens[7] * (1.0 + widest * widest + highest * highest)
-    factor = 1.0 + lens[6] + lens[7] * (widest + highest)
-    return turn * lens[2] + lens[9], turn * lens[3] + lens[9], factor
-
-
-@inlined
 def _windows(
-    room: Singles, x: float, y: float, z: float, one: Spans, lens: Floats, margins: tuple[float, float, float],
+    room: Singles, x: float, y: float, z: float, one: Spans, lens: Floats, shape: tuple[int, int]
 ) -> None:  # fmt: skip
     """Find the windows of the image around the voxels of a part, in a form that the compiler does many at a time.
 
     Args:
         room: Places of the voxels relative to the first (3 rows) [m]; gets the least and largest columns and rows of
-            the windows (4 rows) [cells], and the depths that their cells must have more than [m], shape (8, PART^3).
+            the windows (4 rows) [cells], and the depths that their cells must have more than [m], inf for windows that
+            are not inside of the image, shape (8, PART^3).
         x: Center of the first voxel in the optical frame [m].
         y: As ``x``.
         z: As ``x``.
         one: Half the extents of a voxel along the axes of the optical frame [m].
         lens: See :func:`clear_voxels`.
-        margins: By :func:`_margins`.
+        shape: Rows and columns of cells.
     """
     single = np.float32
     shift, hz, nearest, farthest = single(lens[8]), single(one[2]), single(lens[4]), single(lens[5])
     wide, high = single(one[0] + lens[8]), single(one[1] + lens[8])
-    cu, cv, factor = single(lens[2]), single(lens[3]), single(margins[2])
-    u_low, u_high = single(lens[0] * lens[2] + margins[0]), single(lens[0] * lens[2] - margins[0])
-    v_low, v_high = single(lens[1] * lens[3] + margins[1]), single(lens[1] * lens[3] - margins[1])
-    x_first, y_first, z_first, none = single(x), single(y), single(z), single(math.inf)
+    u_corner, v_corner, u_cells, v_cells = single(lens[0]), single(lens[1]), single(lens[2]), single(lens[3])
+    factor, angle, half = single(1.0 + lens[6]), single(lens[7]), single(lens[9])
+    rows, columns, least = single(shape[0]), single(shape[1]), single(LEAST_DEPTH)
+    x_first, y_first, z_first = single(x), single(y), single(z)
+    zero, unit, none = single(0.0), single(1.0), single(math.inf)
     for m in range(PART * PART * PART):
         across, down, depth = x_first + room[0, m], y_first + room[1, m], z_first + room[2, m]
         front, back = depth - hz, depth + hz
-        reach = back * factor + shift
-        room[7, m] = reach if (front >= nearest) & (back <= farthest) else none
-        front, back = front - shift, back + shift
-        inverse = single(1.0) / (front * back)
-        low, far = inverse * back, inverse * front
+        low, far = unit / (front - shift), unit / (back + shift)
         a, b, c, d = across - wide, across + wide, down - high, down + high
-        room[3, m] = min(a * low, a * far) * cu - u_low
-        room[4, m] = max(b * low, b * far) * cu - u_high
-        room[5, m] = min(c * low, c * far) * cv - v_low
-        room[6, m] = max(d * low, d * far) * cv - v_high
+        u0, u1 = min(a * low, a * far), max(b * low, b * far)
+        v0, v1 = min(c * low, c * far), max(d * low, d * far)
+        widest, highest = max(abs(u0), abs(u1)), max(abs(v0), abs(v1))
+        turn = angle * (unit + widest * widest + highest * highest)
+        u0, u1 = (u0 - turn - u_corner) * u_cells - half, (u1 + turn - u_corner) * u_cells + half
+        v0, v1 = (v0 - turn - v_corner) * v_cells - half, (v1 + turn - v_corner) * v_cells + half
+        seen = (front >= nearest) & (back <= farthest) & (front - shift > least)
+        seen = seen & (u0 >= zero) & (v0 >= zero) & (u1 < columns) & (v1 < rows)
+        room[3, m], room[4, m], room[5, m], room[6, m] = u0, u1, v0, v1
+        room[7, m] = back * (factor + angle * (widest + highest)) + shift if seen else none
 
 
 @inlined
 def _clear_each(
     evidence: Bytes, hits: Bytes, near: Singles, pose: Floats, grid: Floats, lens: Floats, box: Box, one: Spans,
-    margins: tuple[float, float, float], room: Singles,
+    room: Singles,
 ) -> None:  # fmt: skip
-    """Clear the voxels of a part one by one, as :func:`_kind` says, with the margins of the part."""
+    """Clear the voxels of a part one by one, as :func:`_kind` says."""
     _, rows, columns = near.shape
     x, y, z = _middle(grid, pose, (box[0], box[0] + 1, box[2], box[2] + 1, box[4], box[4] + 1))
-    _windows(room, x, y, z, one, lens, margins)
+    _windows(room, x, y, z, one, lens, (rows, columns))
     for i in range(box[0], box[1]):
         for j in range(box[2], box[3]):
             first = ((i - box[0]) * PART + j - box[2]) * PART - box[4]
@@ -274,10 +265,10 @@ def _clear_each(
                     if hits[i, j, k] != ENOUGH and _seen_through(near, place, one[2], lens):
                         evidence[i, j, k] = found - 1
                     continue
-                u0, u1, v0, v1, reach = room[3, m], room[4, m], room[5, m], room[6, m], room[7, m]
-                if u0 < 0.0 or v0 < 0.0 or u1 >= columns or v1 >= rows:
+                reach = room[7, m]
+                if reach == math.inf:
                     continue
-                i0, i1, j0, j1 = int(v0), int(v1), int(u0), int(u1)
+                i0, i1, j0, j1 = int(room[5, m]), int(room[6, m]), int(room[3, m]), int(room[4, m])
                 if reach < near[0, (i0 + i1) >> 1, (j0 + j1) >> 1] and reach < _least_depth(near, i0, i1, j0, j1):
                     evidence[i, j, k] = FREE
 
@@ -313,9 +304,8 @@ def _clear_parts(
                 kind = _kind(near, far, lens, x, y, z, spans, 2.0 * one[2])
                 if kind == IN_FRONT:
                     _lower(evidence, hits, part)
-                elif kind == PARTLY and z - spans[2] - lens[8] > LEAST_DEPTH:
-                    margins = _margins(lens, x, y, z, spans)
-                    _clear_each(evidence, hits, near, pose, grid, lens, part, one, margins, room)
+                elif kind == PARTLY:
+                    _clear_each(evidence, hits, near, pose, grid, lens, part, one, room)
 
 
 @inlined
