@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from apex_ompl.kernel.compiled.layout import Bytes, Integers, Singles
-from apex_ompl.kernel.compiled.perception import voxels
+from apex_ompl.kernel.compiled.perception import depth_windows, voxels
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
 
@@ -117,9 +117,9 @@ class DepthWindows(NamedTuple):
             missing: Largest share of pixels without a depth in a cell that is known, or in those around it.
         """
         rows, columns = blocks.shape
-        near = np.empty((max(min(rows, columns).bit_length(), 3), rows, columns), np.float32)
-        far = np.empty((-(-rows // voxels.TILE), -(-columns // voxels.TILE)), np.float32)
-        voxels.cell_depths(blocks.depths(image), blocks.first, blocks.whole, *span, missing, near, far)
+        near = np.empty((min(max(min(rows, columns).bit_length(), 3), depth_windows.LEVELS), rows, columns), np.float32)
+        far = np.empty((-(-rows // depth_windows.TILE), -(-columns // depth_windows.TILE)), np.float32)
+        depth_windows.cell_depths(blocks.depths(image), blocks.first, blocks.whole, *span, missing, near, far)
         return cls(blocks, near, far, *span)
 
 
@@ -152,10 +152,10 @@ class SeenPoints(NamedTuple):
             support: How many of the 8 pixels around a pixel must be of the same surface for it to have a point.
         """
         found = np.empty(blocks.size, np.float32)
-        voxels.supported_depths(np.ascontiguousarray(image, np.float32), *alike, support, found)
+        depth_windows.supported_depths(np.ascontiguousarray(image, np.float32), *alike, support, found)
         depths = blocks.depths(found)
         inside, ranges = np.zeros(len(depths), np.int8), np.empty((len(blocks.first) - 1, 2), np.float32)
-        voxels.mark_inside(
+        depth_windows.mark_inside(
             depths, blocks.rays, blocks.first, blocks.plane, blocks.shape[1], compact(spheres), ranges, inside
         )
         return cls(blocks.rays, depths, inside, blocks.density)
@@ -219,7 +219,7 @@ class VoxelUpdate(NamedTuple):
         lens = [*corner, *(1.0 / side), windows.nearest, windows.farthest, *errors]
         voxels.clear_voxels(
             evidence, hits, windows.near, windows.far, compact(self.pose), np.append(self.origin, self.side),
-            np.array(lens, float), np.empty(evidence.shape[2], np.int8),
+            np.array(lens, float), np.empty(evidence.shape[2], np.int8), np.empty((8, voxels.PART**3), np.float32),
         )  # fmt: skip
         voxels.forget_hits(hits, cells)
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from apex_ompl.perception.obstacles import ObstacleFinder as ObstacleFinder
     from apex_ompl.perception.obstacles import SeenObstacle as SeenObstacle
     from apex_ompl.perception.occupancy import OccupancyMap as OccupancyMap
-    from apex_ompl.perception.occupancy import OccupancySettings as OccupancySettings
+    from apex_ompl.perception.occupancy_settings import OccupancySettings as OccupancySettings
     from apex_ompl.perception.ros2_camera import Ros2Camera as Ros2Camera
     from apex_ompl.perception.sight import Sight as Sight
     from apex_ompl.perception.sight import see as see
@@ -66,7 +66,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "looking": "LookSettings LookState ObjectView look_plan look_states",
         "obstacle_settings": "ObstacleSettings",
         "obstacles": "ObstacleFinder SeenObstacle",
-        "occupancy": "OccupancyMap OccupancySettings",
+        "occupancy": "OccupancyMap",
+        "occupancy_settings": "OccupancySettings",
         "ros2_camera": "Ros2Camera",
         "solid_fit": "KnownSize",
         "sight": "Sight see",

@@ -9,7 +9,7 @@ no ray is followed.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -17,13 +17,12 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.cloud_contact import on_robot
 from apex_ompl.errors import FileFormatError, ParameterError
-from apex_ompl.kernel.products import product
-from apex_ompl.kernel.voxels import FREE, UNKNOWN, DepthWindows, ImageBlocks, SeenPoints, VoxelUpdate, mark_near
+from apex_ompl.kernel.voxels import FREE, UNKNOWN, DepthWindows, ImageBlocks, SeenPoints, VoxelUpdate
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
+from apex_ompl.perception.occupancy_contact import RobotContact
+from apex_ompl.perception.occupancy_settings import OccupancySettings, settings_of
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.grids import voxels_of
@@ -36,7 +35,6 @@ from apex_ompl.util.validation import (
     check_array,
     check_integer,
     check_name,
-    check_number,
     check_positive,
     finite_array,
     rigid_pose,
@@ -49,56 +47,6 @@ POLICIES, SHAPES = ("free", "blocked"), ("points", "voxels")
 
 Unknown = Literal["free", "blocked"]
 Shape = Literal["points", "voxels"]
-
-
-@dataclass(frozen=True)
-class OccupancySettings:
-    """How frames change a map.
-
-    Attributes:
-        spreads: Standard deviations of the camera's pose and depth scale within which nothing occupied becomes free.
-        missing: Largest share of pixels without a depth in a cell of the image that counts as seen, or in the 3x3 cells
-            around one, whose least depth it has then.
-        block: Side of the cells of the image in which least depths are taken [pixels].
-        stride: Stride of rows and columns of the pixels whose points make voxels occupied.
-        share: Share of the points that a surface across the line of sight leaves in a voxel, at its depth and with the
-            noise of depths, which makes the voxel occupied.
-        least: How many of these points are the least; fewer are enough where hardly as many are to be expected.
-        support: Pixels around one, of 8, that must have about its depth for its point to count: depths at edges are
-            often those of no surface.
-        persistence: Frames that must see through an occupied voxel, after one that saw it occupied, to free it.
-        longest: The largest number of such frames, after many that saw it occupied.
-        padding: Margin around robot and held objects inside of which points belong to them [m]; the noise of depths is
-            added.
-    """
-
-    spreads: float = 2.0
-    missing: float = 0.5
-    block: int = 2
-    stride: int = 2
-    share: float = 0.15
-    least: int = 2
-    support: int = 3
-    persistence: int = 3
-    longest: int = 9
-    padding: float = 0.015
-
-    def __post_init__(self) -> None:
-        """Check the ranges.
-
-        Raises:
-            ParameterError: A value is out of its range.
-        """
-        check_number(self.spreads, "spreads", 0.0, 10.0)
-        check_number(self.missing, "missing", 0.0, 0.99)
-        check_integer(self.block, "block", 1, 64)
-        check_integer(self.stride, "stride", 1, 64)
-        check_number(self.share, "share", 0.0, 1.0)
-        check_integer(self.least, "least", 1, 100)
-        check_integer(self.support, "support", 0, 8)
-        check_integer(self.persistence, "persistence", 1, 100)
-        check_integer(self.longest, "longest", self.persistence, 100)
-        check_number(self.padding, "padding", 0.0, 0.5)
 
 
 class OccupancyMap:
@@ -248,21 +196,16 @@ class OccupancyMap:
         )  # fmt: skip
 
     @cached_property
-    def _checker(self) -> CollisionChecker:
+    def _contact(self) -> RobotContact:
         if self.robot is None:
             raise ParameterError("robot", None, "a map with a robot")
-        return CollisionChecker(self.robot)
+        return RobotContact(self.robot)
 
     def _own_spheres(self, q: Array | None, held: Iterable[AttachedObject], pose: Array, noise: float) -> Array:
         """Return padded spheres around robot and held objects in the optical frame, shape (S, 4) [m]."""
         if q is None:
             return np.empty((0, 4))
-        self._checker.become({}, {one.name: one for one in held}, ())
-        spheres = self._checker.kernel.cover_spheres(q)
-        spheres[:, :3] = product(spheres[:, :3] - pose[:3, 3], pose[:3, :3])
-        far = np.maximum(spheres[:, 2], 0.0)
-        spheres[:, 3] += self.settings.padding + self.settings.spreads * noise * far * far
-        return spheres
+        return self._contact.own_spheres(q, held, pose, self.settings.padding, self.settings.spreads * noise)
 
     def _blocks_of(self, camera: Camera) -> tuple[ImageBlocks, ImageBlocks]:
         """Return the blocks of all pixels of a camera, and of those whose points occupy voxels."""
@@ -322,14 +265,15 @@ class OccupancyMap:
         return found
 
     def blocked(
-        self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
+        self, unknown: Unknown = "free", start: ArrayLike | None = None, *, goal: ArrayLike | None = None,
         held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (),
     ) -> Flags:  # fmt: skip
         """Return the voxels that count as obstacles, shape (nx, ny, nz).
 
         Args:
-            unknown: ``free``: occupied voxels. ``blocked``: unknown ones, too, but for those that the start touches.
+            unknown: ``free``: occupied voxels. ``blocked``: unknown ones, too, but for those that start and goal touch.
             start: Start of the robot, shape (dof,), from which it must be able to move; needed with ``blocked``.
+            goal: States that the user knows to be free, shape (dof,) or (G, dof), such as the goals of a plan.
             held: Objects that it holds there.
             margin: Distance from robot and held objects within which unknown voxels do not count [m].
             assume_free: Boxes in the world whose unknown voxels do not count, as the user knows them to be empty: least
@@ -344,8 +288,10 @@ class OccupancyMap:
             return self.occupied
         if start is None:
             raise ParameterError("start", None, "the start of the plan, whose unknown voxels do not count as obstacles")
-        doubtful = self.unknown & ~self._within(assume_free)
-        return np.asarray(self.occupied | (doubtful & ~self._touched(start, held, margin, doubtful)))
+        doubtful, kept = self.unknown & ~self._within(assume_free), tuple(held)
+        for q in self._known(start, goal):
+            doubtful &= ~self._touched(q, kept, margin, doubtful)
+        return np.asarray(self.occupied | doubtful)
 
     def _within(self, boxes: ArrayLike) -> Flags:
         """Return the voxels with their centers in boxes in the world, shape (B, 2, 3) [m]."""
@@ -373,40 +319,45 @@ class OccupancyMap:
         Raises:
             ParameterError: The state has another shape, the margin is out of range, or the map has no robot.
         """
-        return self._touched(state, held, margin, np.ones(self.evidence.shape, bool))
+        return self._touched(self._contact.state(state), held, margin, np.ones(self.evidence.shape, bool))
 
-    def _touched(self, state: ArrayLike, held: Iterable[AttachedObject], margin: float, among: Flags) -> Flags:
+    def _touched(self, q: Array, held: Iterable[AttachedObject], margin: float, among: Flags) -> Flags:
         """Return the voxels of :meth:`touched` among some, shape (nx, ny, nz)."""
-        checker, kept = self._checker, {one.name: one for one in held}
-        q = finite_array(state, "state")
-        check_array(q, (checker.robot.dof,), "state")
-        check_number(margin, "margin", 0.0, 0.5)
-        within = margin + 0.5 * np.sqrt(3.0) * self.resolution
-        checker.become({}, kept, ())
-        spheres = checker.kernel.cover_spheres(q)
-        spheres[:, 3] += within
-        found = among & (mark_near(self.evidence.shape, self.origin, self.resolution, spheres) != 0)
-        cells = np.argwhere(found)
-        found[tuple(cells.T)] = on_robot(self._centers(cells), checker.robot, q, within, kept.values())
-        return np.asarray(found)
+        return self._contact.touched(q, held, margin, among, origin=self.origin, side=self.resolution)
+
+    def _known(self, start: ArrayLike | None, goal: ArrayLike | None) -> Array:
+        """Return the states in which the robot is known to be free, shape (M, dof)."""
+        states = [] if start is None else [self._contact.state(start, "start")]
+        if goal is not None:
+            given = np.atleast_2d(finite_array(goal, "goal"))
+            check_array(given, ("N", self._contact.robot.dof), "goal")
+            states += [*given]
+        return np.array(states)
 
     def _centers(self, cells: Indices) -> Array:
         return np.asarray(self.origin + (cells + 0.5) * self.resolution)
 
     def points(
-        self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
+        self, unknown: Unknown = "free", start: ArrayLike | None = None, *, goal: ArrayLike | None = None,
         held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (),
     ) -> Array:  # fmt: skip
         """Return the centers of the voxels of :meth:`blocked`, whose arguments it has, shape (N, 3) [m].
 
         Balls of the radius ``ball_radius`` around them contain the voxels:
-        ``world.set_points("map", seen.points(), seen.ball_radius)``.
+        ``world.set_points("map", seen.points(), seen.ball_radius)``. Where start and goal are given, in which the
+        robot is free, balls that reach into it there are moved out of it: noise has put them there. Those with their
+        centers more than ``padding`` inside stay.
 
         Raises:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
-        return self._centers(
-            np.argwhere(self.blocked(unknown, start, held=held, margin=margin, assume_free=assume_free))
+        kept = tuple(held)
+        flags = self.blocked(unknown, start, goal=goal, held=kept, margin=margin, assume_free=assume_free)
+        found, states = self._centers(np.argwhere(flags)), self._known(start, goal)
+        return (
+            self._contact.moved_out(found, self.ball_radius, states, kept, self.settings.padding)
+            if len(states)
+            else found
         )
 
     @property
@@ -415,7 +366,7 @@ class OccupancyMap:
         return 0.5 * float(np.sqrt(3.0)) * self.resolution
 
     def world(
-        self, unknown: Unknown = "free", start: ArrayLike | None = None, *,
+        self, unknown: Unknown = "free", start: ArrayLike | None = None, *, goal: ArrayLike | None = None,
         held: Iterable[AttachedObject] = (), margin: float = 0.01, assume_free: ArrayLike = (), name: str = "map",
         shape: Shape = "points",
     ) -> tuple[Obstacle, ...]:  # fmt: skip
@@ -426,12 +377,13 @@ class OccupancyMap:
         Args:
             unknown: As there.
             start: As there.
+            goal: As there.
             held: As there.
             margin: As there.
             assume_free: As there.
             name: Name of the obstacle.
-            shape: ``points``: the balls of :meth:`points` and ``ball_radius``, which contain the voxels. ``voxels``:
-                the cubes themselves.
+            shape: ``points``: the balls of :meth:`points` and ``ball_radius``, which contain the voxels, but for those
+                that are moved out of the robot. ``voxels``: the cubes themselves, also where they touch the robot.
 
         Returns:
             One obstacle, or none where no voxel counts as one.
@@ -440,12 +392,12 @@ class OccupancyMap:
             ParameterError, UnknownNameError: As :meth:`blocked`.
         """
         check_name(shape, "shape of a map", SHAPES)
-        flags = self.blocked(unknown, start, held=held, margin=margin, assume_free=assume_free)
-        if not flags.any():
-            return ()
-        if shape == "voxels":
-            return (Obstacle(name=name, voxels=voxels_of(flags, self.resolution, self.origin)),)
-        return (Obstacle(name=name, points=points_of(self._centers(np.argwhere(flags)), self.ball_radius)),)
+        about: dict[str, Any] = {"goal": goal, "held": tuple(held), "margin": margin, "assume_free": assume_free}
+        if shape == "points":
+            points = self.points(unknown, start, **about)
+            return (Obstacle(name=name, points=points_of(points, self.ball_radius)),) if len(points) else ()
+        flags = self.blocked(unknown, start, **about)
+        return (Obstacle(name=name, voxels=voxels_of(flags, self.resolution, self.origin)),) if flags.any() else ()
 
     def save(self, path: str | Path) -> None:
         """Write the map (``.npz``, ``schema: apex-ompl/occupancy/1``), without the robot.
@@ -479,7 +431,7 @@ class OccupancyMap:
             found = "none" if evidence is None else f"{evidence.dtype} of shape {evidence.shape}"
             raise FileFormatError(str(file), "evidence", found, "expected int8 of shape (nx, ny, nz)")
         try:
-            settings = _settings(about.get("settings"))
+            settings = settings_of(about.get("settings"))
             origin = finite_array(about.get("origin", ()), "origin")
             check_array(origin, (3,), "origin")
             side = about.get("resolution", np.nan)
@@ -492,15 +444,3 @@ class OccupancyMap:
             raise FileFormatError(str(file), error.name, error.value, f"expected {error.expected}") from error
         made.evidence[:] = evidence
         return made
-
-
-def _settings(given: Any) -> OccupancySettings:
-    """Return settings by their names.
-
-    Raises:
-        ParameterError: They are no mapping, or one is unknown or out of its range.
-    """
-    known = tuple(asdict(OccupancySettings()))
-    if not isinstance(given, dict) or not {*given} <= {*known}:
-        raise ParameterError("settings", given, f"a mapping of {', '.join(known)}")
-    return OccupancySettings(**given)

@@ -7,25 +7,31 @@ errors of a stereo camera (``benchmarks/perception/depth_rays.py``). "look-up" i
 "rays" (with ``--rays``) follows the ray of every fourth pixel, with the same hits and the same filter of the robot, and
 lowers the evidence of the voxels on its way once an image each.
 
-``ms`` is CPU time of one image on one core, with the filter of the robot. "covered" is the share of the surface seen
-without noise that has an occupied voxel within a voxel of it. "off" are occupied voxels that touch no solid, or are 3
-cm off. "freed" is the share of the voxels with their centers in a solid, the robot's among them, that are free.
-"sure" is the share of the voxels free by rays without errors that are free.
+``ms`` is CPU time of one image on one core, with the filter of the robot, into a map of 1.6 x 1.6 x 1.2 m; "large ms"
+of 2.4 x 2.4 x 1.6 m, which the shares are of. The first image of a map is left out. "covered" is the share of the
+surface seen without noise that has an occupied voxel within a voxel of it. "off" are occupied voxels that touch no
+solid, or are 3 cm off. "freed" is the share of the voxels with their centers in a solid, the robot's among them, that
+are free. "sure" is the share of the voxels free by rays without errors that are free.
 
 Plans are made by the default planner, with a margin of 5 cm around the start, in maps of 20 and 10 mm: from nine
 places all around at the start ("around"), or from the three places in front in six states of the robot that are free
-("sweep"); every state of the paths, 0.02 rad apart, is checked in the true scene by Coal alone. Of those that fail,
-"goal on occupied" and "goal on unknown" are those whose goal touches such voxels.
+("sweep"); every state of the paths, 0.02 rad apart, is checked in the true scene by Coal alone. Goals that are "told"
+are given to the map as free (``goal=``). Of those that fail, "goal on occupied" and "goal on unknown" are those whose
+goal touches such voxels.
 
 "update" is CPU time from a depth image of the last place to the edited world of a planner, in maps of 20 mm.
+
+What was measured of a problem is kept in benchmarks/runs/voxels, and an interrupted command goes on from there; remove
+the folder to measure anew.
 
 Usage: python -m benchmarks.perception.voxels [-n 50] [--plans 60] [--rays]
 """
 
 from __future__ import annotations
 
+import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -48,17 +54,23 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import write_atomically
 from benchmarks.lib import record
 from benchmarks.perception.depth_rays import RayScene, measured
 
 DEPENDS = (
     "@planning", "apex_ompl/perception/camera.py", "apex_ompl/perception/frames.py",
-    "apex_ompl/perception/occupancy.py", "apex_ompl/perception/rendering.py", "benchmarks/perception/depth_rays.py",
+    "apex_ompl/perception/occupancy.py", "apex_ompl/perception/occupancy_contact.py",
+    "apex_ompl/perception/occupancy_settings.py", "apex_ompl/perception/rendering.py",
+    "benchmarks/perception/depth_rays.py",
 )  # fmt: skip
 CAMERA = Camera(
     width=640, height=480, focal=(465.0, 465.0), center=(319.5, 239.5), position_spread=0.002, angle_spread=0.0015
 )
 BOX = np.array([[-0.6, -1.2, -0.1], [1.8, 1.2, 1.5]])
+SMALL = np.array([[0.0, -0.8, -0.1], [1.6, 0.8, 1.1]])  # box that images are timed in
+RUNS = record.ROOT / "benchmarks" / "runs" / "voxels"
+PLAN_TIME = 10.0  # [s]
 SIDES = (0.01, 0.02, 0.04)
 SEEDS = {"ZBuffer": 31, "MuJoCo": 32}
 PLAN_SEED = 33
@@ -255,32 +267,35 @@ def tested(made: Robot, problem: Problem, seen: list[Look], side: float, rays: b
     truth = truth_of(made, problem, q, seen, OccupancyMap(BOX, side, made))
     found: dict[str, dict[str, Any]] = {}
     for name in ("look-up", "rays")[: 1 + rays]:
-        one = OccupancyMap(BOX, side, made)
-        times = []
-        for look in seen:
+        one, small = OccupancyMap(BOX, side, made), OccupancyMap(SMALL, side, made)
+        times: dict[int, list[float]] = {0: [], 1: []}
+        for look, (k, into) in product(seen, enumerate((small, one))):
             started = time.process_time()
             if name == "rays":
-                by_rays(one, CAMERA, look, q, held)
+                by_rays(into, CAMERA, look, q, held)
             else:
-                one.integrate(look.depth, CAMERA, look.assumed, q, held)
-            times.append(1e3 * (time.process_time() - started))
-        found[name] = {"ms": times[1:], **errors(one, truth)}
+                into.integrate(look.depth, CAMERA, look.assumed, q, held)
+            times[k].append(1e3 * (time.process_time() - started))
+        found[name] = {"ms": times[0][1:], "large_ms": times[1][1:], **errors(one, truth)}
     return found
 
 
-def planned(made: Robot, problem: Problem, seen: OccupancyMap, q: np.ndarray, unknown: Any) -> dict[str, Any]:
-    """Return how a plan in a map went."""
-    world = seen.world(unknown, q, held=problem.attached, margin=MARGIN)
+def planned(
+    made: Robot, problem: Problem, seen: OccupancyMap, q: np.ndarray, *, unknown: Any, told: bool
+) -> dict[str, Any]:  # fmt: skip
+    """Return how a plan in a map went, which is ``told`` that the goal is free."""
+    goal = np.array([problem.goal.joints[0][joint] for joint in made.joint_names])
+    world = seen.world(unknown, q, goal=goal if told else None, held=problem.attached, margin=MARGIN)
     started = time.process_time()
-    result = plan(problem.model_copy(update={"scene": world, "allowed": ()}), timeout=20.0, seed=0)
+    result = plan(problem.model_copy(update={"scene": world, "allowed": ()}), timeout=PLAN_TIME, seed=0)
     spent = time.process_time() - started
     if result and result.path is not None:
         truth = CollisionChecker(made, problem.scene, problem.attached, problem.allowed, proofs=False)
         return {"cause": "", "free": bool(truth.are_free(result.path.sample(0.02)).all()), "cpu_s": spent}
     cause = str(result.status)
     if cause == "INVALID_GOAL":
-        goal = np.array([problem.goal.joints[0][joint] for joint in made.joint_names])
-        occupied = CollisionChecker(made, seen.world(), problem.attached, proofs=False)
+        world = seen.world("free", q, goal=goal if told else None, held=problem.attached)
+        occupied = CollisionChecker(made, world, problem.attached, proofs=False)
         cause = "goal on unknown" if occupied.is_free(goal) else "goal on occupied"
     return {"cause": cause, "reason": result.reason, "cpu_s": spent}
 
@@ -327,11 +342,33 @@ def plans_of(made: Robot, name: str, k: int) -> list[dict[str, Any]]:
         for look in views[seen]:
             kept.integrate(look.depth, CAMERA, look.assumed, look.state, problem.attached)
         about = {"problem": name, "views": seen, "side": side}
-        for unknown in ("free", "blocked"):
-            found.append({**about, "unknown": unknown, **planned(made, problem, kept, q, unknown)})
+        for unknown, told in product(("free", "blocked"), (False, True) if side == PLANNED[0] else (True,)):
+            how = planned(made, problem, kept, q, unknown=unknown, told=told)
+            found.append({**about, "unknown": unknown, "told": told, **how})
         if side == PLANNED[0]:
-            found[-2]["update_ms"] = updated(made, problem, kept, views[seen][-1])
+            found[-3]["update_ms"] = updated(made, problem, kept, views[seen][-1])
     return found
+
+
+def stored(name: str, measure: Callable[[], Any]) -> Any:
+    """Return what was measured of a problem before, or measure and keep it."""
+    file = RUNS / f"{name}.json"
+    if not file.exists():
+        file.parent.mkdir(exist_ok=True, parents=True)
+        write_atomically(file, json.dumps(measure()).encode())
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def images_of(made: Robot, name: str, renderer: str, k: int, rays: bool) -> list[tuple[str, float, dict[str, Any]]]:
+    """Return ways, sides of voxels, and what was measured of the k-th problem drawn by a renderer."""
+    problem = problems.load(name)
+    q = np.array([problem.start[joint] for joint in made.joint_names])
+    scene = RENDERERS[renderer](made, [*problem.scene, *ROOM], problem.attached)
+    seen = looks(scene, [q], np.random.default_rng((SEEDS[renderer], k)), FRONT)
+    return [(way, side, row) for side in SIDES for way, row in tested(made, problem, seen, side, rays).items()]
+
+
+RENDERERS: dict[str, Any] = {"ZBuffer": DrawnScene, "MuJoCo": RayScene}
 
 
 def main() -> None:
@@ -342,16 +379,14 @@ def main() -> None:
     given, made = parser.parse_args(), robot()
     names = [problems.frozen_names(suite, "easy")[k] for k in range(100) for suite in SUITES]
     found: dict[tuple[str, str, float], list[dict[str, Any]]] = {}
-    for kind, (renderer, seed) in zip((DrawnScene, RayScene), SEEDS.items(), strict=True):
+    for renderer in RENDERERS:
         for k, name in enumerate(tqdm(names[: given.n], desc=renderer)):
-            problem = problems.load(name)
-            q = np.array([problem.start[joint] for joint in made.joint_names])
-            scene = kind(made, [*problem.scene, *ROOM], problem.attached)
-            seen = looks(scene, [q], np.random.default_rng((seed, k)), FRONT)
-            for side in SIDES:
-                for way, row in tested(made, problem, seen, side, given.rays).items():
-                    found.setdefault((way, renderer, side), []).append(row)
-    plans = [one for k, name in enumerate(tqdm(names[: given.plans], desc="plans")) for one in plans_of(made, name, k)]
+            about = f"{renderer}{'-rays' if given.rays else ''}-{k}"
+            for way, side, row in stored(about, lambda n=name, k=k, r=renderer: images_of(made, n, r, k, given.rays)):
+                found.setdefault((way, renderer, side), []).append(row)
+    plans = []
+    for k, name in enumerate(tqdm(names[: given.plans], desc="plans")):
+        plans += stored(f"plans-{k}", lambda n=name, k=k: plans_of(made, n, k))
     lines = [tables(found), "", plan_table(plans)]
     rows = [{"way": way, "renderer": by, "side": side, "problems": some} for (way, by, side), some in found.items()]
     record.write("perception_voxels", {"rows": rows, "plans": plans}, "\n".join(lines), n=given.n, plans=given.plans)
@@ -360,12 +395,22 @@ def main() -> None:
 def tables(found: dict[tuple[str, str, float], list[dict[str, Any]]]) -> str:
     """Return the table of times and shares, means over problems."""
     kinds = ("covered", "off", "far off", "free", "sure", "freed")
-    head = ["voxels", "renderer", "mm", "N images", "ms p50", "ms p95", *[f"{kind} %" for kind in kinds]]
+    head = [
+        "voxels",
+        "renderer",
+        "mm",
+        "N images",
+        "ms p50",
+        "ms p95",
+        "large ms p50",
+        *[f"{kind} %" for kind in kinds],
+    ]
     lines = [record.row(head), record.row(["---", "---", *["---:"] * (len(head) - 2)])]
     for (way, by, side), some in sorted(found.items(), key=lambda item: (item[0][2], item[0][0], item[0][1])):
         times = np.concatenate([one["ms"] for one in some])
         shares = [f"{100.0 * np.mean([one[kind] for one in some]):.2f}" for kind in kinds]
-        spent = (f"{value:.1f}" for value in record.percentiles(times, 50, 95))
+        large = np.median(np.concatenate([one["large_ms"] for one in some]))
+        spent = (f"{value:.1f}" for value in (*record.percentiles(times, 50, 95), large))
         lines.append(record.row([way, by, f"{1e3 * side:g}", len(FRONT) * len(some), *spent, *shares]))
     return "\n".join(lines)
 
@@ -377,6 +422,7 @@ def plan_table(plans: list[dict[str, Any]]) -> str:
         "views",
         "mm",
         "unknown space",
+        "goal",
         "N",
         "solved",
         "free in the true scene",
@@ -384,15 +430,16 @@ def plan_table(plans: list[dict[str, Any]]) -> str:
         "CPU s p50",
         "update ms p50",
     ]
-    lines = [record.row(head), record.row(["---", "---:", "---", *["---:"] * (len(head) - 3)])]
-    groups = sorted({(one["views"], -one["side"], one["unknown"]) for one in plans})
-    for views, side, unknown in groups:
-        some = [one for one in plans if (one["views"], -one["side"], one["unknown"]) == (views, side, unknown)]
+    lines = [record.row(head), record.row(["---", "---:", "---", "---", *["---:"] * (len(head) - 4)])]
+    kinds = [(one["views"], -one["side"], one["unknown"], one["told"]) for one in plans]
+    for views, side, unknown, told in sorted(set(kinds)):
+        some = [one for one, kind in zip(plans, kinds, strict=True) if kind == (views, side, unknown, told)]
         solved = [one for one in some if not one["cause"]]
         counts = [sum(one["cause"] == cause for one in some) for cause in causes]
         edits = [one["update_ms"] for one in some if "update_ms" in one]
         spent = f"{np.median([one['cpu_s'] for one in some]):.1f}", f"{np.median(edits):.0f}" if edits else ""
-        cells = [views, f"{-1e3 * side:g}", unknown, len(some), len(solved), sum(one["free"] for one in solved)]
+        goal, right = "told" if told else "", sum(one["free"] for one in solved)
+        cells = [views, f"{-1e3 * side:g}", unknown, goal, len(some), len(solved), right]
         lines.append(record.row([*cells, *counts, *spent]))
     return "\n".join(lines)
 

@@ -370,8 +370,8 @@ OTHERS: Functions = {
         "f8[:, ::1], i8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[::1], f8[::1]",
         3,
     ),
-    "perception.voxels.cell_depths": ("f4[::1], i8[::1], i1[::1], f8, f8, f8, f4[:, :, ::1], f4[:, ::1]", 1),
-    "perception.voxels.mark_inside": (
+    "perception.depth_windows.cell_depths": ("f4[::1], i8[::1], i1[::1], f8, f8, f8, f4[:, :, ::1], f4[:, ::1]", 1),
+    "perception.depth_windows.mark_inside": (
         "f4[::1], f4[:, ::1], i8[::1], f8[:, ::1], i8, f8[:, ::1], f4[:, ::1], i1[::1]",
         1,
     ),
@@ -381,11 +381,11 @@ OTHERS: Functions = {
         1,
     ),
     "perception.voxels.clear_voxels": (
-        "i1[:, :, ::1], i1[:, :, ::1], f4[:, :, ::1], f4[:, ::1], f8[:, ::1], f8[::1], f8[::1], i1[::1]",
+        "i1[:, :, ::1], i1[:, :, ::1], f4[:, :, ::1], f4[:, ::1], f8[:, ::1], f8[::1], f8[::1], i1[::1], f4[:, ::1]",
         2,
     ),
     "perception.voxels.forget_hits": ("i1[:, :, ::1], i8[::1]", 1),
-    "perception.voxels.supported_depths": ("f4[:, ::1], f8, f8, i8, f4[:, ::1]", 1),
+    "perception.depth_windows.supported_depths": ("f4[:, ::1], f8, f8, i8, f4[:, ::1]", 1),
     "perception.voxels.mark_near": ("i1[:, :, ::1], f8[:, ::1], f8[::1], f8", 1),
     "geometry.triangles.column_boxes": ("f8[:, :, ::1], f8[::1], f8[::1], f8, f8[:, :, ::1], f8[:, :, :, :, ::1]", 1),
 }

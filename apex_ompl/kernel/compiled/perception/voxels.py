@@ -1,7 +1,6 @@
 """Voxels that a depth image shows to be free or occupied: each is looked up in the image, no ray is followed.
 
-Pixels stand in the order of square blocks of the plane at depth 1 of the optical frame, so that distortion is no matter
-here. Numbers are of single precision; sums are taken in the order in which they stand.
+The image is given as :mod:`.depth_windows` has it. Numbers are of single precision.
 """
 
 from __future__ import annotations
@@ -12,176 +11,18 @@ import numpy as np
 
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Bytes, Floats, Integers, Singles
+from apex_ompl.kernel.compiled.perception.depth_windows import TILE, UNSEEN
 
 FREE, UNKNOWN = -1, 0  # evidence of a voxel; above it the voxel is occupied
 ENOUGH = 127  # number of points of a voxel that an image shows to be occupied
 MOST_OF = 0.5  # share of the points to be expected that is enough where these are few
-UNSEEN = 0.0  # depth of a cell that is not known
-TILE = 8  # cells along a side of the tiles whose largest depths are kept
-BLOCK = 8  # voxels along a side of the blocks that are decided together
+LEAST_DEPTH = 1e-3  # of what is looked up in the image [m]
+BLOCK, PART = 8, 4  # voxels along a side of the blocks that are decided together, and of their parts
 HIDDEN, PARTLY, IN_FRONT = -1, 0, 1
 
 Box = tuple[int, int, int, int, int, int]
 """First voxel and that after the last along each axis."""
 Spans = tuple[float, float, float]
-
-
-@inlined
-def _filled(near: Singles, first: Integers, missing: float, i: int, j: int) -> float:
-    """Return the least depth of the 3x3 cells around one, UNSEEN where too many of their pixels have none."""
-    _, rows, columns = near.shape
-    low, gaps, count = math.inf, 0.0, 0
-    for a in range(max(i - 1, 0), min(i + 2, rows)):
-        for b in range(max(j - 1, 0), min(j + 2, columns)):
-            low, gaps = min(low, near[1, a, b]), gaps + near[2, a, b]
-            count += first[a * columns + b + 1] - first[a * columns + b]
-    return low if gaps <= missing * count else UNSEEN
-
-
-@inlined
-def _widen(near: Singles, level: int) -> None:
-    """Find the least depths of the windows of a level from those of the level below."""
-    rows, columns, half = near.shape[1], near.shape[2], 1 << (level - 1)
-    high, wide = max(rows - 2 * half + 1, 0), max(columns - 2 * half + 1, 0)
-    below, found = near[level - 1], near[level]
-    for i in range(rows):
-        for j in range(wide if i < high else 0):
-            found[i, j] = min(below[i, j], below[i, j + half], below[i + half, j], below[i + half, j + half])
-        for j in range(wide if i < high else 0, columns):
-            found[i, j] = UNSEEN
-
-
-@entry_point
-def cell_depths(
-    depths: Singles, first: Integers, whole: Bytes, nearest: float, farthest: float, missing: float, near: Singles,
-    far: Singles,
-) -> None:  # fmt: skip
-    """Find the least depths of cells and of square windows of them, and the largest depths of tiles.
-
-    A cell without a depth for too many of its pixels has the least depth of the 3x3 cells around it, if these have
-    enough.
-
-    Args:
-        depths: Depths of the pixels in the order of cells, shape (P,) [m]; UNSEEN where there is none.
-        first: First pixel of each cell, and P, shape (rows columns + 1,).
-        whole: Whether the image holds a cell as a whole, shape (rows columns,).
-        nearest: Smallest depth that counts [m].
-        farthest: Depth up to which a larger one shows the space to be free [m].
-        missing: Largest share of pixels without a depth.
-        near: Gets the least depths of windows of 2^n x 2^n cells that begin at a cell, shape (levels, rows, columns)
-            [m]; UNSEEN where one of them is not known, or outside of the image. There are three levels at least.
-        far: Gets the largest depth of a cell in each tile of TILE x TILE cells, shape (rows / TILE, columns / TILE),
-            rounded up [m].
-    """
-    levels, rows, columns = near.shape
-    for i in range(rows):
-        for j in range(columns):
-            cell, gaps, low = i * columns + j, 0, farthest
-            for p in range(first[cell], first[cell + 1]):
-                if depths[p] >= nearest:
-                    low = min(low, depths[p])
-                else:
-                    gaps += 1
-            near[1, i, j], near[2, i, j] = low, gaps
-    for i in range(far.shape[0]):
-        for j in range(far.shape[1]):
-            far[i, j] = UNSEEN
-    for i in range(rows):
-        for j in range(columns):
-            cell = i * columns + j
-            low, count = near[1, i, j], first[cell + 1] - first[cell]
-            if whole[cell] == 0:
-                low = UNSEEN
-            elif count == 0 or near[2, i, j] > missing * count:
-                low = _filled(near, first, missing, i, j)
-            near[0, i, j] = low
-            far[i // TILE, j // TILE] = max(far[i // TILE, j // TILE], low)
-    for level in range(1, levels):
-        _widen(near, level)
-
-
-@entry_point
-def supported_depths(image: Singles, noise: float, slack: float, least: int, found: Singles) -> None:
-    """Take depths at a stride, UNSEEN where too few of the 8 pixels around have about the same.
-
-    Args:
-        image: Depths, shape (height, width) [m]; UNSEEN where there is none.
-        noise: Depths z differ by at most ``noise`` z^2 and ``slack`` [1/m].
-        slack: See ``noise`` [m].
-        least: How many of the 8 pixels must.
-        found: Gets the depths, shape (rows, columns) [m]; the strides are quotients of the shapes, rounded up.
-    """
-    height, width = image.shape
-    rows, columns = found.shape
-    step, pace = (height + rows - 1) // rows, (width + columns - 1) // columns
-    for i in range(rows):
-        for j in range(columns):
-            v, u = i * step, j * pace
-            depth = image[v, u]
-            limit, count = noise * depth * depth + slack, 0
-            for a in range(max(v - 1, 0), min(v + 2, height)):
-                for b in range(max(u - 1, 0), min(u + 2, width)):
-                    if abs(image[a, b] - depth) <= limit:
-                        count += 1
-            found[i, j] = depth if count > least else UNSEEN
-
-
-@inlined
-def _tangents(across: float, along: float, radius: float) -> tuple[float, float]:
-    """Return the least and the largest x / z of a circle about x = ``across``, z = ``along``, more than its radius."""
-    square = across * across + along * along - radius * radius
-    turn, bottom = radius * math.sqrt(square), along * along - radius * radius
-    return (across * along - turn) / bottom, (across * along + turn) / bottom
-
-
-@entry_point
-def mark_inside(
-    depths: Singles, rays: Singles, first: Integers, plane: Floats, columns: int, spheres: Floats, ranges: Singles,
-    inside: Bytes,
-) -> None:  # fmt: skip
-    """Mark the pixels whose points are inside of any sphere.
-
-    Args:
-        depths: Depths of the pixels in the order of blocks, shape (P,) [m].
-        rays: Their points at depth 1, shape (P, 2).
-        first: First pixel of each block, and P, shape (rows columns + 1,).
-        plane: Corner of the first block and sides of a block at depth 1, shape (2, 2).
-        columns: Columns of blocks.
-        spheres: Centers in the optical frame and radii, shape (S, 4) [m].
-        ranges: Gets the least and the largest depth of each block, shape (rows columns, 2) [m].
-        inside: Gets 1 for these pixels, shape (P,); 0 at the start.
-    """
-    rows = (len(first) - 1) // columns
-    for block in range(rows * columns):
-        low, high = math.inf, UNSEEN
-        for p in range(first[block], first[block + 1]):
-            if depths[p] > UNSEEN:
-                low, high = min(low, depths[p]), max(high, depths[p])
-        ranges[block, 0], ranges[block, 1] = low, high
-    for s in range(len(spheres)):
-        x, y, z, radius = spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3]
-        if z <= -radius:
-            continue
-        i0, i1, j0, j1 = 0, rows - 1, 0, columns - 1
-        if z > radius:
-            low, high = _tangents(x, z, radius)
-            j0 = max(j0, math.floor((low - plane[0, 0]) / plane[1, 0]))
-            j1 = min(j1, math.floor((high - plane[0, 0]) / plane[1, 0]))
-            low, high = _tangents(y, z, radius)
-            i0 = max(i0, math.floor((low - plane[0, 1]) / plane[1, 1]))
-            i1 = min(i1, math.floor((high - plane[0, 1]) / plane[1, 1]))
-        for i in range(int(i0), int(i1) + 1):
-            for j in range(int(j0), int(j1) + 1):
-                block = i * columns + j
-                if ranges[block, 0] > z + radius or ranges[block, 1] < z - radius:
-                    continue
-                for p in range(first[block], first[block + 1]):
-                    depth = depths[p]
-                    if abs(depth - z) > radius or inside[p] != 0:
-                        continue
-                    a, b, c = rays[p, 0] * depth - x, rays[p, 1] * depth - y, depth - z
-                    if a * a + b * b + c * c <= radius * radius:
-                        inside[p] = 1
 
 
 @entry_point
@@ -265,9 +106,9 @@ def _least_depth(near: Singles, i0: int, i1: int, j0: int, j1: int) -> float:
     levels, rows, columns = near.shape
     if i0 < 0 or j0 < 0 or i1 >= rows or j1 >= columns:
         return UNSEEN
-    size, level = min(i1 - i0, j1 - j0) + 1, 0
-    while 2 << level <= size:
-        level += 1
+    size = min(i1 - i0, j1 - j0)
+    level = (size > 0) + (size > 2) + (size > 6) + (size > 14) + (size > 30)  # of LEVELS, without branches
+    level = min(level, levels - 1)
     width = 1 << level
     i, j = i1 - width + 1, j1 - width + 1
     found = min(near[level, i0, j0], near[level, i0, j], near[level, i, j0], near[level, i, j])
@@ -279,18 +120,18 @@ def _least_depth(near: Singles, i0: int, i1: int, j0: int, j1: int) -> float:
 
 
 @inlined
-def _largest_depth(far: Singles, rows: int, columns: int, i0: int, i1: int, j0: int, j1: int) -> float:
+def _largest_depth(far: Singles, rows: int, columns: int, i0: float, i1: float, j0: float, j1: float) -> float:
     """Return the largest depth of the tiles that a rectangle of cells reaches into; UNSEEN outside of the image."""
     found = UNSEEN
-    for i in range(max(i0, 0) // TILE, min(i1, rows - 1) // TILE + 1):
-        for j in range(max(j0, 0) // TILE, min(j1, columns - 1) // TILE + 1):
+    for i in range(int(max(i0, 0.0)) // TILE, int(min(i1, rows - 1.0)) // TILE + 1):
+        for j in range(int(max(j0, 0.0)) // TILE, int(min(j1, columns - 1.0)) // TILE + 1):
             found = max(found, far[i, j])
     return found
 
 
 @inlined
 def _kind(
-    near: Singles, far: Singles, lens: Floats, x: float, y: float, z: float, spans: Spans, block: bool,
+    near: Singles, far: Singles, lens: Floats, x: float, y: float, z: float, spans: Spans, thick: float,
 ) -> int:  # fmt: skip
     """Return whether a box is IN_FRONT of all surfaces around it, or HIDDEN: behind them all, or outside of the image.
 
@@ -302,13 +143,13 @@ def _kind(
         y: As ``x``.
         z: As ``x``.
         spans: Half the extents of the box along the axes of the optical frame [m].
-        block: Whether HIDDEN is to be told from PARTLY.
+        thick: Extent of a voxel along the optical axis [m].
     """
     shift = lens[8]
     front, back = z - spans[2], z + spans[2]
-    if block and (back < lens[4] or front > lens[5]):
+    if back < lens[4] or front > lens[5]:
         return HIDDEN
-    if front - shift <= 1e-3:
+    if front - shift <= LEAST_DEPTH:
         return PARTLY
     low, high = 1.0 / (front - shift), 1.0 / (back + shift)
     u0, u1 = _quotients(x, spans[0] + shift, low, high)
@@ -324,11 +165,8 @@ def _kind(
         reach = back * (1.0 + lens[6] + lens[7] * (widest + highest)) + shift
         if reach < _least_depth(near, int(i0), int(i1), int(j0), int(j1)):
             return IN_FRONT
-    if block:
-        a, b = max(i0, 0.0), max(j0, 0.0)
-        i, j = min(i1, rows - 1.0), min(j1, columns - 1.0)
-        if front >= _largest_depth(far, rows, columns, int(a), int(i), int(b), int(j)):
-            return HIDDEN
+    if front + thick >= _largest_depth(far, rows, columns, i0, i1, j0, j1):
+        return HIDDEN
     return PARTLY
 
 
@@ -355,29 +193,119 @@ def _middle(grid: Floats, pose: Floats, box: Box) -> tuple[float, float, float]:
 
 
 @inlined
-def _clear_each(
-    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, grid: Floats, lens: Floats, box: Box,
-    spans: Spans,
+def _seen_through(near: Singles, center: Spans, half: float, lens: Floats) -> bool:
+    """Return whether the cell at the center of a voxel is farther away than the voxel; ``half`` is its half depth."""
+    (_, rows, columns), (x, y, z) = near.shape, center
+    if z < lens[4] + half:
+        return False
+    u, v = (x / z - lens[0]) * lens[2], (y / z - lens[1]) * lens[3]
+    return bool(0.0 <= u < columns and 0.0 <= v < rows and z + half < near[0, int(v), int(u)])
+
+
+@inlined
+def _windows(
+    room: Singles, x: float, y: float, z: float, one: Spans, lens: Floats, shape: tuple[int, int]
 ) -> None:  # fmt: skip
-    """Clear the voxels of a box one by one."""
-    rows, columns, hz, side = near.shape[1], near.shape[2], spans[2], grid[3]
+    """Find the windows of the image around the voxels of a part, in a form that the compiler does many at a time.
+
+    Args:
+        room: Places of the voxels relative to the first (3 rows) [m]; gets the least and largest columns and rows of
+            the windows (4 rows) [cells], and the depths that their cells must have more than [m], inf for windows that
+            are not inside of the image, shape (8, PART^3).
+        x: Center of the first voxel in the optical frame [m].
+        y: As ``x``.
+        z: As ``x``.
+        one: Half the extents of a voxel along the axes of the optical frame [m].
+        lens: See :func:`clear_voxels`.
+        shape: Rows and columns of cells.
+    """
+    single = np.float32
+    shift, hz, nearest, farthest = single(lens[8]), single(one[2]), single(lens[4]), single(lens[5])
+    wide, high = single(one[0] + lens[8]), single(one[1] + lens[8])
+    u_corner, v_corner, u_cells, v_cells = single(lens[0]), single(lens[1]), single(lens[2]), single(lens[3])
+    factor, angle, half = single(1.0 + lens[6]), single(lens[7]), single(lens[9])
+    rows, columns, least = single(shape[0]), single(shape[1]), single(LEAST_DEPTH)
+    x_first, y_first, z_first = single(x), single(y), single(z)
+    zero, unit, none = single(0.0), single(1.0), single(math.inf)
+    for m in range(PART * PART * PART):
+        across, down, depth = x_first + room[0, m], y_first + room[1, m], z_first + room[2, m]
+        front, back = depth - hz, depth + hz
+        low, far = unit / (front - shift), unit / (back + shift)
+        a, b, c, d = across - wide, across + wide, down - high, down + high
+        u0, u1 = min(a * low, a * far), max(b * low, b * far)
+        v0, v1 = min(c * low, c * far), max(d * low, d * far)
+        widest, highest = max(abs(u0), abs(u1)), max(abs(v0), abs(v1))
+        turn = angle * (unit + widest * widest + highest * highest)
+        u0, u1 = (u0 - turn - u_corner) * u_cells - half, (u1 + turn - u_corner) * u_cells + half
+        v0, v1 = (v0 - turn - v_corner) * v_cells - half, (v1 + turn - v_corner) * v_cells + half
+        seen = (front >= nearest) & (back <= farthest) & (front - shift > least)
+        seen = seen & (u0 >= zero) & (v0 >= zero) & (u1 < columns) & (v1 < rows)
+        room[3, m], room[4, m], room[5, m], room[6, m] = u0, u1, v0, v1
+        room[7, m] = back * (factor + angle * (widest + highest)) + shift if seen else none
+
+
+@inlined
+def _clear_each(
+    evidence: Bytes, hits: Bytes, near: Singles, pose: Floats, grid: Floats, lens: Floats, box: Box, one: Spans,
+    room: Singles,
+) -> None:  # fmt: skip
+    """Clear the voxels of a part one by one, as :func:`_kind` says."""
+    _, rows, columns = near.shape
+    x, y, z = _middle(grid, pose, (box[0], box[0] + 1, box[2], box[2] + 1, box[4], box[4] + 1))
+    _windows(room, x, y, z, one, lens, (rows, columns))
     for i in range(box[0], box[1]):
         for j in range(box[2], box[3]):
-            x, y, z = _middle(grid, pose, (i, i + 1, j, j + 1, box[4], box[4] + 1))
+            first = ((i - box[0]) * PART + j - box[2]) * PART - box[4]
             for k in range(box[4], box[5]):
-                found = evidence[i, j, k]
-                if found <= FREE or hits[i, j, k] == ENOUGH:
+                found, m = evidence[i, j, k], first + k
+                if found <= FREE:
                     continue
-                step = (k - box[4]) * side
-                depth = z + step * pose[2, 2]
-                if depth < lens[4] + hz:
+                if found > UNKNOWN:
+                    place = x + room[0, m], y + room[1, m], z + room[2, m]
+                    if hits[i, j, k] != ENOUGH and _seen_through(near, place, one[2], lens):
+                        evidence[i, j, k] = found - 1
                     continue
-                across, down, inverse = x + step * pose[2, 0], y + step * pose[2, 1], 1.0 / depth
-                u, v = (across * inverse - lens[0]) * lens[2], (down * inverse - lens[1]) * lens[3]
-                if not (0.0 <= u < columns and 0.0 <= v < rows and depth + hz < near[0, int(v), int(u)]):
-                    continue  # neither condition can hold
-                if found > UNKNOWN or _kind(near, far, lens, across, down, depth, spans, False) == IN_FRONT:
-                    evidence[i, j, k] = found - 1
+                reach = room[7, m]
+                if reach == math.inf:
+                    continue
+                i0, i1, j0, j1 = int(room[5, m]), int(room[6, m]), int(room[3, m]), int(room[4, m])
+                if reach < near[0, (i0 + i1) >> 1, (j0 + j1) >> 1] and reach < _least_depth(near, i0, i1, j0, j1):
+                    evidence[i, j, k] = FREE
+
+
+@inlined
+def _busy(evidence: Bytes, box: Box) -> bool:
+    """Return whether any voxel of a box is not FREE."""
+    for i in range(box[0], box[1]):
+        for j in range(box[2], box[3]):
+            for k in range(box[4], box[5]):
+                if evidence[i, j, k] > FREE:
+                    return True
+    return False
+
+
+@inlined
+def _clear_parts(
+    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, grid: Floats, lens: Floats, box: Box,
+    one: Spans, room: Singles,
+) -> None:  # fmt: skip
+    """Clear the voxels of a box by parts of PART x PART x PART voxels, and one by one where a part is PARTLY in front.
+
+    ``one`` has half the extents of a voxel along the axes of the optical frame [m].
+    """
+    spans = PART * one[0], PART * one[1], PART * one[2]
+    for i in range(box[0], box[1], PART):
+        for j in range(box[2], box[3], PART):
+            for k in range(box[4], box[5], PART):
+                part = i, min(i + PART, box[1]), j, min(j + PART, box[3]), k, min(k + PART, box[5])
+                if not _busy(evidence, part):
+                    continue
+                x, y, z = _middle(grid, pose, part)
+                kind = _kind(near, far, lens, x, y, z, spans, 2.0 * one[2])
+                if kind == IN_FRONT:
+                    _lower(evidence, hits, part)
+                elif kind == PARTLY:
+                    _clear_each(evidence, hits, near, pose, grid, lens, part, one, room)
 
 
 @inlined
@@ -394,8 +322,9 @@ def _largest(evidence: Bytes, i0: int, i1: int, j0: int, j1: int, found: Bytes) 
 
 @entry_point
 def clear_voxels(
-    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, grid: Floats, lens: Floats, largest: Bytes
-) -> None:
+    evidence: Bytes, hits: Bytes, near: Singles, far: Singles, pose: Floats, grid: Floats, lens: Floats, largest: Bytes,
+    room: Singles,
+) -> None:  # fmt: skip
     """Lower the evidence of voxels that are in front of all surfaces which the image shows where they appear.
 
     A voxel that holds no points becomes FREE step by step where it is in front of all depths of the cells that its
@@ -413,8 +342,13 @@ def clear_voxels(
             free, and the largest [m]; relative error of depths; errors of the camera's orientation [rad] and
             position [m]; half a pixel [cells].
         largest: Room for numbers of voxels along the last axis, shape (nz,).
+        room: Room for numbers of the voxels of a part, shape (8, PART^3).
     """
     nx, ny, nz = evidence.shape
+    for m in range(PART * PART * PART):
+        i, j, k = m // (PART * PART), m // PART % PART, m % PART
+        for axis in range(3):
+            room[axis, m] = grid[3] * (i * pose[0, axis] + j * pose[1, axis] + k * pose[2, axis])
     half = 0.5 * grid[3]
     hx = half * (abs(pose[0, 0]) + abs(pose[1, 0]) + abs(pose[2, 0]))
     hy = half * (abs(pose[0, 1]) + abs(pose[1, 1]) + abs(pose[2, 1]))
@@ -432,7 +366,7 @@ def clear_voxels(
                 if not busy:
                     continue
                 x, y, z = _middle(grid, pose, (i0, i1, j0, j1, k0, k1))
-                kind = _kind(near, far, lens, x, y, z, many, True)
+                kind = _kind(near, far, lens, x, y, z, many, 2.0 * hz)
                 if kind == IN_FRONT:
                     start = k0 if start < 0 else start
                     continue
@@ -441,7 +375,7 @@ def clear_voxels(
                     start = -1
                 if kind == HIDDEN:
                     continue
-                _clear_each(evidence, hits, near, far, pose, grid, lens, (i0, i1, j0, j1, k0, k1), one)
+                _clear_parts(evidence, hits, near, far, pose, grid, lens, (i0, i1, j0, j1, k0, k1), one, room)
             if start >= 0:
                 _lower(evidence, hits, (i0, i1, j0, j1, start, nz))
 
