@@ -10,7 +10,7 @@ cost.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -54,6 +54,13 @@ MISFIT, GROWTH = 1.2, 1.5  # mean squared error of points over that of noise abo
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 NOT_THERE = "no surface is seen where the hand holds it"
+STEPS = 5, 6  # from each start, and of what was found from there
+LAST = 0.018  # residual from which points do not count in the end [m]
+SAME_FIT = 9.0, 0.1  # squared difference of fits in units of their own and of grasps' spread within which they are one
+HOPELESS = 60.0, 1.3  # cost above which a fit is not refined, and its part that grows with that of the best one
+SPREAD_PIXELS = 6  # around a drawing to which its depths are extended
+OUTSIDE = (-1e3, 0.0, 1e2)  # a point that no image shows [m]
+FAR_AWAY = 1e3  # depth behind everything [m]
 FARTHEST = 36.0  # squared error of six dimensions that a grasp exceeds three times in a million
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
 
@@ -348,20 +355,43 @@ class HeldObjectFinder:
         if count < s.least_points:
             around = measured[_cells(window)]
             return _without(one, _nothing_seen(one.body.name, around, robot, center[2] - radius), count)
-        kept = points[np.linspace(0, len(points) - 1, min(len(points), s.most_points)).astype(np.int64)]
-        settings = self._fit_settings(one, seen, window, len(points) / len(kept))
+        kept, thinning = self._thinned(points)
         prior = np.asarray(np.linalg.inv(turned(one.covariance, registration.pose[:3, :3].T)), float)
         if s.size_spread > 0.0:
             sizes = np.where(np.isin(range(3), one.ties), s.size_spread**-2, UNKNOWN)
             prior = np.block([[prior, np.zeros((6, 3))], [np.zeros((3, 6)), np.diag(sizes)]])
+        model = own, one.surface.vertices, one.surface.faces, one.ties, one.symmetry
+        settings = self._fit_settings(one, seen, window, thinning)
         fits = [
-            fit_surface(kept, beyond, own, one.surface.vertices, one.surface.faces, one.ties, one.symmetry, start,
-                        expected, prior, settings)
+            fit_surface(_outlined(kept), beyond, *model, start, expected, prior, settings, len(kept))
             for start in self._starts(one, expected, registration)
-        ]  # fmt: skip
+        ]
+        around = np.ascontiguousarray(measured[_cells(window)])
+        local = Window(0, 0, window.width, window.height, 1)
+        refined: list[SurfaceFit] = []
+        distinct = _different(fits, prior)
+        for fit in distinct:
+            passable = _blocked(fit, around, robot, near_robot, 2.0 * noise, s.thickness)
+            points, beyond = select_points(
+                passable, robot, near_robot, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness
+            )
+            if len(points) == 0:
+                continue
+            kept, thinning = self._thinned(points)
+            settings = replace(self._fit_settings(one, seen, window, thinning), first=LAST, steps=STEPS[1])
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = fit.rotation, fit.position
+            refined.append(
+                fit_surface(_outlined(kept), beyond, *model, pose, expected, prior, settings, len(kept))
+            )
         outliers = 0.5 / 3.0 * (settings.last / (noise * center[2] ** 2 + s.floor)) ** 2  # by Tukey's loss
         region = _Region(window, prior, settings.point_share * len(kept), count, float(outliers))
-        return self._answer(one, fits, seen, region)
+        return self._answer(one, refined, seen, region)
+
+    def _thinned(self, points: Array) -> tuple[Array, float]:
+        """Return points of which there are not too many, and the number for which each stands."""
+        kept = points[np.linspace(0, len(points) - 1, min(len(points), self.settings.most_points)).astype(np.int64)]
+        return kept, len(points) / len(kept)
 
     def _fit_settings(self, one: Expected, seen: CorrectedFrame, window: Window, thinning: float) -> FitSettings:
         """Return the weights of points that stand for others, of pixels that share their noise in patches."""
@@ -371,7 +401,7 @@ class HeldObjectFinder:
         return FitSettings(
             noise=seen.noise, floor=s.floor, edge=s.edge,
             point_share=s.point_share * thinning / max(1.0, patch) / inflation,
-            contour_share=s.contour_share * window.stride / inflation, first=0.03, last=0.018, reach=0.02, steps=8,
+            contour_share=s.contour_share * window.stride / inflation, first=0.03, last=LAST, reach=0.02, steps=STEPS[0],
         )  # fmt: skip
 
     def _starts(self, one: Expected, expected: Array, registration: Registration) -> list[Array]:
@@ -423,6 +453,59 @@ class HeldObjectFinder:
             return _without(one, f"{one.body.name!r}: what is seen is not where the hand holds it", count)
         lever = np.kron(np.eye(2), registration.pose[:3, :3]) @ common[:6]
         return HeldObject(one.body, "", found, world, best.scale, size, share, count, misfit, lever)
+
+
+def _outlined(points: Array) -> Array:
+    """Return points and one outside of the image, the first of those that are the outline's.
+
+    With these the contour resists where it touches what it must not cover. Otherwise steps overshoot there: pixels
+    that are covered count, but not those that are covered after a step.
+    """
+    return np.vstack([points, OUTSIDE])
+
+
+def _different(fits: Sequence[SurfaceFit], prior: Array) -> list[SurfaceFit]:
+    """Return the fits that are not the same as a better one, nor much worse than the best, the best first."""
+    found: list[SurfaceFit] = []
+    for fit in sorted(fits, key=lambda one: one.cost):
+        if not np.isfinite(fit.cost) or (found and fit.cost > HOPELESS[0] + HOPELESS[1] * found[0].cost):
+            break
+        if not any(_same(fit, other, prior[:6, :6]) for other in found):
+            found.append(fit)
+    return found
+
+
+def _same(fit: SurfaceFit, other: SurfaceFit, prior: Array) -> bool:
+    """Whether two fits differ by little of what was measured, or of what grasps vary by."""
+    off = np.concatenate([pin.log3(fit.rotation @ other.rotation.T), fit.position - other.position])
+    told = other.information[:6, :6] - prior
+    return float(off @ told @ off) < SAME_FIT[0] or float(off @ prior @ off) < SAME_FIT[1]
+
+
+def _blocked(
+    fit: SurfaceFit, measured: Array, robot: Array, near_robot: Array, noise: float, slack: float
+) -> Array:  # fmt: skip
+    """Return measured depths, those of the robot that an object would hide, and so cannot cover, as far away.
+
+    Args:
+        fit: Where the object is.
+        measured: Depths in the window, shape (h, w) [m].
+        robot: Expected depths of the robot there, infinite where there is none [m].
+        near_robot: The same of a robot that is thicker all around.
+        noise: Largest error of depth z over z^2 [1/m].
+        slack: Difference of depths that may be an error beside it [m].
+    """
+    depth = np.where(fit.triangle >= 0, fit.depth, np.inf)
+    for _ in range(SPREAD_PIXELS):
+        wider = np.full((depth.shape[0] + 2, depth.shape[1] + 2), np.inf)
+        wider[1:-1, 1:-1] = depth
+        around = np.minimum(
+            np.minimum(wider[:-2, 1:-1], wider[2:, 1:-1]), np.minimum(wider[1:-1, :-2], wider[1:-1, 2:])
+        )
+        depth = np.where(np.isfinite(depth), depth, around)
+    allowed = slack + noise * measured**2
+    own = ((measured > near_robot - allowed) & (measured < robot + allowed)) | (np.abs(measured - near_robot) < allowed)
+    return np.where(own & (measured > depth + allowed), FAR_AWAY, measured)
 
 
 def _far_from(one: Expected, pose: Array) -> bool:
