@@ -54,13 +54,15 @@ MISFIT, GROWTH = 1.2, 1.5  # mean squared error of points over that of noise abo
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 NOT_THERE = "no surface is seen where the hand holds it"
-STEPS = 5, 6  # from each start, and of what was found from there
-LAST = 0.018  # residual from which points do not count in the end [m]
+ALONE = 0.33  # share of the contour's measurements in one frame, in which depths at edges are missing
+STEPS = 4, 5  # from each start, and of what was found from there
+TUKEY = 3.3  # standard deviations of a point from which it does not count in the end
+LAST = 0.018  # residual from which points do not count in fits from the starts [m]
 SAME_FIT = 9.0, 0.1  # squared difference of fits in units of their own and of grasps' spread within which they are one
 HOPELESS = 60.0, 1.3  # cost above which a fit is not refined, and its part that grows with that of the best one
-SPREAD_PIXELS = 6  # around a drawing to which its depths are extended
+SPREAD_PIXELS = 4  # around a drawing to which its depths are extended
 OUTSIDE = (-1e3, 0.0, 1e2)  # a point that no image shows [m]
-FAR_AWAY = 1e3  # depth behind everything [m]
+FAR_AWAY = 100.0  # depth behind everything [m]
 FARTHEST = 36.0  # squared error of six dimensions that a grasp exceeds three times in a million
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
 
@@ -92,11 +94,12 @@ class HeldSettings:
     registration: RegistrationSettings | None = field(default_factory=RegistrationSettings)
     thickness: float = 0.005
     floor: float = 0.0005
-    edge: float = 0.4
+    edge: float = 0.3
     point_share: float = 1.4
     contour_share: float = 0.15
     starts: tuple[float, ...] = (0.0, -18.0, 18.0)
-    most_points: int = 300
+    most_points: int = 600
+    first_points: int = 200
     least_points: int = 60
     least_seen: float = 0.2
     most_misfit: float = 10.0
@@ -217,14 +220,12 @@ class _Region(NamedTuple):
         prior: Information before, shape (6, 6) or (9, 9).
         share: Independent measurements, over all points.
         pixels: Number of pixels that may be the object's.
-        outliers: Mean squared error over that of noise where half of the points are on no surface.
     """
 
     window: Window
     prior: Array
     share: float
     pixels: int
-    outliers: float
 
 
 class Expected(NamedTuple):
@@ -355,7 +356,7 @@ class HeldObjectFinder:
         if count < s.least_points:
             around = measured[_cells(window)]
             return _without(one, _nothing_seen(one.body.name, around, robot, center[2] - radius), count)
-        kept, thinning = self._thinned(points)
+        kept, thinning = self._thinned(points, s.first_points)
         prior = np.asarray(np.linalg.inv(turned(one.covariance, registration.pose[:3, :3].T)), float)
         if s.size_spread > 0.0:
             sizes = np.where(np.isin(range(3), one.ties), s.size_spread**-2, UNKNOWN)
@@ -366,42 +367,49 @@ class HeldObjectFinder:
             fit_surface(_outlined(kept), beyond, *model, start, expected, prior, settings, len(kept))
             for start in self._starts(one, expected, registration)
         ]
+        best = min(fit.cost for fit in fits)
+        if not np.isfinite(best):
+            return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
+        outliers = 0.5 / 3.0 * (LAST / (noise * center[2] ** 2 + s.floor)) ** 2  # half of the points, by Tukey's loss
+        if best > max(s.most_misfit, outliers) * settings.point_share * len(kept):
+            return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
         around = np.ascontiguousarray(measured[_cells(window)])
         local = Window(0, 0, window.width, window.height, 1)
+        last = TUKEY * float(np.hypot(noise * center[2] ** 2, s.floor))
+        steps = STEPS[1] if s.size_spread == 0.0 else sum(STEPS)  # of scales that start at 1 again
         refined: list[SurfaceFit] = []
         distinct = _different(fits, prior)
         for fit in distinct:
             passable = _blocked(fit, around, robot, near_robot, 2.0 * noise, s.thickness)
             points, beyond = select_points(
-                passable, robot, near_robot, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness
+                *passable, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness
             )
-            if len(points) == 0:
-                continue
-            kept, thinning = self._thinned(points)
-            settings = replace(self._fit_settings(one, seen, window, thinning), first=LAST, steps=STEPS[1])
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = fit.rotation, fit.position
+            kept, thinning = self._thinned(points, s.most_points)
+            settings = replace(self._fit_settings(one, seen, window, thinning), first=LAST, last=last, steps=steps)
+            start = np.eye(4)
+            start[:3, :3], start[:3, 3] = fit.rotation, fit.position
             refined.append(
-                fit_surface(_outlined(kept), beyond, *model, pose, expected, prior, settings, len(kept))
+                fit_surface(_outlined(kept), beyond, *model, start, expected, prior, settings, len(kept))
             )
-        outliers = 0.5 / 3.0 * (settings.last / (noise * center[2] ** 2 + s.floor)) ** 2  # by Tukey's loss
-        region = _Region(window, prior, settings.point_share * len(kept), count, float(outliers))
+        region = _Region(window, prior, settings.point_share * len(kept), count)
         return self._answer(one, refined, seen, region)
 
-    def _thinned(self, points: Array) -> tuple[Array, float]:
+    @staticmethod
+    def _thinned(points: Array, most: int) -> tuple[Array, float]:
         """Return points of which there are not too many, and the number for which each stands."""
-        kept = points[np.linspace(0, len(points) - 1, min(len(points), self.settings.most_points)).astype(np.int64)]
-        return kept, len(points) / len(kept)
+        kept = points[np.linspace(0, len(points) - 1, min(len(points), most)).astype(np.int64)]
+        return kept, len(points) / max(len(kept), 1)
 
     def _fit_settings(self, one: Expected, seen: CorrectedFrame, window: Window, thinning: float) -> FitSettings:
         """Return the weights of points that stand for others, of pixels that share their noise in patches."""
         s = self.settings
         patch = (seen.camera.depth.correlation / window.stride) ** 2
-        inflation = one.inflation[0 if seen.noise == seen.camera.depth.noise else 1]
+        alone = seen.noise == seen.camera.depth.noise
+        inflation = one.inflation[0 if alone else 1]
         return FitSettings(
             noise=seen.noise, floor=s.floor, edge=s.edge,
             point_share=s.point_share * thinning / max(1.0, patch) / inflation,
-            contour_share=s.contour_share * window.stride / inflation, first=0.03, last=LAST, reach=0.02, steps=STEPS[0],
+            contour_share=s.contour_share * (ALONE if alone else 1.0) * window.stride / inflation, first=0.03, last=LAST, reach=0.02, steps=STEPS[0],
         )  # fmt: skip
 
     def _starts(self, one: Expected, expected: Array, registration: Registration) -> list[Array]:
@@ -422,9 +430,7 @@ class HeldObjectFinder:
         best = min(fits, key=lambda fit: fit.cost)
         if not np.isfinite(best.cost):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
-        misfit = best.cost / region.share
-        if misfit > max(self.settings.most_misfit, region.outliers):
-            return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
+        misfit = best.cost / max(region.share, 1e-9)
         factor = max(1.0, misfit / MISFIT) ** GROWTH  # of the variances of measurements
         n = len(best.information)
         covariance: Array = np.zeros((n, n))
@@ -484,8 +490,8 @@ def _same(fit: SurfaceFit, other: SurfaceFit, prior: Array) -> bool:
 
 def _blocked(
     fit: SurfaceFit, measured: Array, robot: Array, near_robot: Array, noise: float, slack: float
-) -> Array:  # fmt: skip
-    """Return measured depths, those of the robot that an object would hide, and so cannot cover, as far away.
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return measured and expected depths, what an object would hide, and so cannot cover, far away and not the robot's.
 
     Args:
         fit: Where the object is.
@@ -495,6 +501,10 @@ def _blocked(
         noise: Largest error of depth z over z^2 [1/m].
         slack: Difference of depths that may be an error beside it [m].
     """
+    allowed = slack + noise * measured**2
+    own = ((measured > near_robot - allowed) & (measured < robot + allowed)) | (np.abs(measured - near_robot) < allowed)
+    if not own.any():
+        return measured, robot, near_robot
     depth = np.where(fit.triangle >= 0, fit.depth, np.inf)
     for _ in range(SPREAD_PIXELS):
         wider = np.full((depth.shape[0] + 2, depth.shape[1] + 2), np.inf)
@@ -503,9 +513,10 @@ def _blocked(
             np.minimum(wider[:-2, 1:-1], wider[2:, 1:-1]), np.minimum(wider[1:-1, :-2], wider[1:-1, 2:])
         )
         depth = np.where(np.isfinite(depth), depth, around)
-    allowed = slack + noise * measured**2
-    own = ((measured > near_robot - allowed) & (measured < robot + allowed)) | (np.abs(measured - near_robot) < allowed)
-    return np.where(own & (measured > depth + allowed), FAR_AWAY, measured)
+    blocked = own & (measured > depth + allowed)
+    return (
+        np.where(blocked, FAR_AWAY, measured), np.where(blocked, np.inf, robot), np.where(blocked, np.inf, near_robot)
+    )  # fmt: skip
 
 
 def _far_from(one: Expected, pose: Array) -> bool:
