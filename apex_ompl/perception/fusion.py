@@ -26,7 +26,7 @@ from apex_ompl.types import Array
 CAMERA = 7  # errors of a camera: turn, shift, scale of depths
 MEASURED = 0.95  # share of the grasp's variance below which a look has measured a direction
 ROUNDS = 3  # of the linearization of turns
-SHARED = 1.43
+SHARED = 1.0
 """Factor of fused variances, for errors of surfaces and fingers that all looks have in common.
 
 It makes mean normalized squared errors those of chi-squared on scenes of their own (``python -m

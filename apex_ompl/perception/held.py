@@ -39,8 +39,8 @@ from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
 INFLATION = {
-    "box": (1.19, 0.93), "cylinder": (0.83, 0.55), "capsule": (0.83, 0.55), "slender": (0.66, 0.31),
-    "sphere": (0.96, 0.68), "mesh": (1.45, 0.76), "thin mesh": (1.17, 0.67),
+    "box": (1.44, 0.56), "cylinder": (1.07, 0.57), "capsule": (1.07, 0.57), "slender": (1.06, 0.68),
+    "sphere": (1.08, 0.63), "mesh": (1.42, 0.70), "thin mesh": (1.02, 0.59),
 }  # fmt: skip
 """Factors of the variances of measurements by shape: of one frame, and of means of frames, without flying pixels.
 
@@ -50,7 +50,7 @@ benchmarks.perception.held --calibrate``).
 SLENDER = 0.3  # radius over half length of cylinders and capsules below which they are slender
 THIN = 0.5  # share of the volume of its hull below which a mesh is thin
 ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in which they agree, and their least number
-MISFIT, GROWTH = 1.2, 1.5  # mean squared error of points over that of noise above which variances grow, and its power
+MISFIT, GROWTH = 1.0, 1.5  # mean squared error of points over that of noise above which variances grow, and its power
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 NOT_THERE = "no surface is seen where the hand holds it"
