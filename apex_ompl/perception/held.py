@@ -55,7 +55,9 @@ SAME = 0.02  # difference from the measured depth within which a surface was mea
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 NOT_THERE = "no surface is seen where the hand holds it"
 ALONE = 0.33  # share of the contour's measurements in one frame, in which depths at edges are missing
-STEPS = 4, 5  # from each start, and of what was found from there
+STEPS = 4, 4  # from each start, and in a round of what was found from there
+ROUNDS = 3, 3  # at most, with the wide and the narrow cutoff
+SETTLED = 1.0  # decrease of the cost in a round below which a fit has settled
 TUKEY = 3.3  # standard deviations of a point from which it does not count in the end
 LAST = 0.018  # residual from which points do not count in fits from the starts [m]
 SAME_FIT = 9.0, 0.1  # squared difference of fits in units of their own and of grasps' spread within which they are one
@@ -376,7 +378,6 @@ class HeldObjectFinder:
         around = np.ascontiguousarray(measured[_cells(window)])
         local = Window(0, 0, window.width, window.height, 1)
         last = TUKEY * float(np.hypot(noise * center[2] ** 2, s.floor))
-        steps = STEPS[1] if s.size_spread == 0.0 else sum(STEPS)  # of scales that start at 1 again
         refined: list[SurfaceFit] = []
         distinct = _different(fits, prior)
         for fit in distinct:
@@ -385,12 +386,16 @@ class HeldObjectFinder:
                 *passable, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness
             )
             kept, thinning = self._thinned(points, s.most_points)
-            settings = replace(self._fit_settings(one, seen, window, thinning), first=LAST, last=last, steps=steps)
-            start = np.eye(4)
-            start[:3, :3], start[:3, 3] = fit.rotation, fit.position
-            refined.append(
-                fit_surface(_outlined(kept), beyond, *model, start, expected, prior, settings, len(kept))
-            )
+            settings = replace(self._fit_settings(one, seen, window, thinning), first=LAST, steps=STEPS[1])
+            data = _outlined(kept), beyond, *model
+            for cutoff, rounds in ((LAST, ROUNDS[0]), (last, ROUNDS[1])):
+                settings, cost = replace(settings, first=cutoff, last=cutoff), np.inf
+                for _ in range(rounds):
+                    fit = fit_surface(*data, _pose_of(fit), expected, prior, settings, len(kept))
+                    if not fit.cost < cost - SETTLED:
+                        break
+                    cost = fit.cost
+            refined.append(fit)
         region = _Region(window, prior, settings.point_share * len(kept), count)
         return self._answer(one, refined, seen, region)
 
@@ -446,8 +451,7 @@ class HeldObjectFinder:
             away[:3] = pin.log3(fit.rotation @ best.rotation.T)
             away[3:6] = fit.position - best.position
             covariance = covariance + weight * (own + lever @ registration.covariance @ lever.T + np.outer(away, away))
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = best.rotation, best.position
+        pose = _pose_of(best)
         share, missed = _measured_shares(best, seen.depth[_cells(region.window)])
         if missed > share:
             return _without(one, f"{one.body.name!r}: {NOT_THERE}", count)
@@ -459,6 +463,13 @@ class HeldObjectFinder:
             return _without(one, f"{one.body.name!r}: what is seen is not where the hand holds it", count)
         lever = np.kron(np.eye(2), registration.pose[:3, :3]) @ common[:6]
         return HeldObject(one.body, "", found, world, best.scale, size, share, count, misfit, lever)
+
+
+def _pose_of(fit: SurfaceFit) -> Array:
+    """Return the pose of a fit in the optical frame, shape (4, 4) [m]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = fit.rotation, fit.position
+    return pose
 
 
 def _outlined(points: Array) -> Array:
