@@ -39,8 +39,8 @@ from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
 INFLATION = {
-    "box": (1.44, 0.56), "cylinder": (1.07, 0.57), "capsule": (1.07, 0.57), "slender": (1.06, 0.68),
-    "sphere": (1.08, 0.63), "mesh": (1.42, 0.70), "thin mesh": (1.02, 0.59),
+    "box": (1.50, 0.56), "cylinder": (1.05, 0.56), "capsule": (1.05, 0.56), "slender": (1.10, 0.52),
+    "sphere": (1.02, 0.62), "mesh": (1.40, 0.68), "thin mesh": (1.06, 0.59),
 }  # fmt: skip
 """Factors of the variances of measurements by shape: of one frame, and of means of frames, without flying pixels.
 
@@ -55,15 +55,22 @@ SAME = 0.02  # difference from the measured depth within which a surface was mea
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 NOT_THERE = "no surface is seen where the hand holds it"
 ALONE = 0.33  # share of the contour's measurements in one frame, in which depths at edges are missing
-STEPS = 4, 4  # from each start, and in a round of what was found from there
-ROUNDS = 3, 3  # at most, with the wide and the narrow cutoff
-SETTLED = 1.0  # decrease of the cost in a round below which a fit has settled
+STEPS = 4, 3  # from each start, and in a round of what was found from there
+ROUNDS = 3  # at most
+SETTLED = 0.3  # squared change in a round, in units of its covariance, below which a fit has settled
 TUKEY = 3.3  # standard deviations of a point from which it does not count in the end
 LAST = 0.018  # residual from which points do not count in fits from the starts [m]
 SAME_FIT = 9.0, 0.1  # squared difference of fits in units of their own and of grasps' spread within which they are one
 HOPELESS = 60.0, 1.3  # cost above which a fit is not refined, and its part that grows with that of the best one
+MOST_FITS, UNLIKELY = 2, 20.0  # fits that are refined, and difference of costs from which the worse one is not
+FIRST, REACH = 0.03, 0.02  # residuals from which points at the first step, and contours, do not count [m]
 SPREAD_PIXELS = 4  # around a drawing to which its depths are extended
-OUTSIDE = (-1e3, 0.0, 1e2)  # a point that no image shows [m]
+OUTSIDE = (-1e3, 0.0, 1e2)
+"""A point of the outline that no image shows [m].
+
+With one the contour resists where it touches what it must not cover. Otherwise steps overshoot there, as only those
+pixels count that are covered already, and fits swing to and fro by several pixels.
+"""
 FAR_AWAY = 100.0  # depth behind everything [m]
 FARTHEST = 36.0  # squared error of six dimensions that a grasp exceeds three times in a million
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
@@ -100,8 +107,8 @@ class HeldSettings:
     point_share: float = 1.4
     contour_share: float = 0.15
     starts: tuple[float, ...] = (0.0, -18.0, 18.0)
-    most_points: int = 600
-    first_points: int = 200
+    most_points: int = 450
+    first_points: int = 150
     least_points: int = 60
     least_seen: float = 0.2
     most_misfit: float = 10.0
@@ -228,6 +235,26 @@ class _Region(NamedTuple):
     prior: Array
     share: float
     pixels: int
+
+
+class _Sight(NamedTuple):
+    """An object in a frame.
+
+    Attributes:
+        one: The object.
+        seen: The frame.
+        window: Part of the image.
+        lens: Lens of the window.
+        expected: Pose in the optical frame that the grasp gives, shape (4, 4) [m].
+        prior: Information before, shape (6, 6) or (9, 9).
+    """
+
+    one: Expected
+    seen: CorrectedFrame
+    window: Window
+    lens: Array
+    expected: Array
+    prior: Array
 
 
 class Expected(NamedTuple):
@@ -358,64 +385,85 @@ class HeldObjectFinder:
         if count < s.least_points:
             around = measured[_cells(window)]
             return _without(one, _nothing_seen(one.body.name, around, robot, center[2] - radius), count)
-        kept, thinning = self._thinned(points, s.first_points)
         prior = np.asarray(np.linalg.inv(turned(one.covariance, registration.pose[:3, :3].T)), float)
         if s.size_spread > 0.0:
             sizes = np.where(np.isin(range(3), one.ties), s.size_spread**-2, UNKNOWN)
             prior = np.block([[prior, np.zeros((6, 3))], [np.zeros((3, 6)), np.diag(sizes)]])
-        model = own, one.surface.vertices, one.surface.faces, one.ties, one.symmetry
-        settings = self._fit_settings(one, seen, window, thinning)
+        sight = _Sight(one, seen, window, own, expected, prior)
         fits = [
-            fit_surface(_outlined(kept), beyond, *model, start, expected, prior, settings, len(kept))
+            self._fit(sight, (points, beyond), start, s.first_points, STEPS[0])
             for start in self._starts(one, expected, registration)
         ]
         best = min(fit.cost for fit in fits)
         if not np.isfinite(best):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
         outliers = 0.5 / 3.0 * (LAST / (noise * center[2] ** 2 + s.floor)) ** 2  # half of the points, by Tukey's loss
-        if best > max(s.most_misfit, outliers) * settings.point_share * len(kept):
+        if best > max(s.most_misfit, outliers) * self._share(sight, points):
             return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
         around = np.ascontiguousarray(measured[_cells(window)])
         local = Window(0, 0, window.width, window.height, 1)
         last = TUKEY * float(np.hypot(noise * center[2] ** 2, s.floor))
-        refined: list[SurfaceFit] = []
-        distinct = _different(fits, prior)
+        distinct = _different(fits, prior)[:MOST_FITS]
+        wide, refined, data = list[SurfaceFit](), list[SurfaceFit](), list[tuple[Array, Array]]()
         for fit in distinct:
             passable = _blocked(fit, around, robot, near_robot, 2.0 * noise, s.thickness)
-            points, beyond = select_points(
-                *passable, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness
+            data.append(
+                select_points(*passable, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness)
             )
-            kept, thinning = self._thinned(points, s.most_points)
-            settings = replace(self._fit_settings(one, seen, window, thinning), first=LAST, steps=STEPS[1])
-            data = _outlined(kept), beyond, *model
-            for cutoff, rounds in ((LAST, ROUNDS[0]), (last, ROUNDS[1])):
-                settings, cost = replace(settings, first=cutoff, last=cutoff), np.inf
-                for _ in range(rounds):
-                    fit = fit_surface(*data, _pose_of(fit), expected, prior, settings, len(kept))
-                    if not fit.cost < cost - SETTLED:
-                        break
-                    cost = fit.cost
-            refined.append(fit)
-        region = _Region(window, prior, settings.point_share * len(kept), count)
+            wide.append(self._settled(sight, data[-1], fit, s.first_points, LAST))
+        least = min(fit.cost for fit in wide)
+        for fit, mine in zip(wide, data, strict=True):
+            if fit.cost <= least + UNLIKELY:
+                refined.append(self._settled(sight, mine, fit, s.most_points, last))
+        points = data[0][0]
+        region = _Region(window, prior, self._share(sight, points), count)
         return self._answer(one, refined, seen, region)
 
-    @staticmethod
-    def _thinned(points: Array, most: int) -> tuple[Array, float]:
-        """Return points of which there are not too many, and the number for which each stands."""
-        kept = points[np.linspace(0, len(points) - 1, min(len(points), most)).astype(np.int64)]
-        return kept, len(points) / max(len(kept), 1)
+    def _settled(
+        self, sight: _Sight, data: tuple[Array, Array], fit: SurfaceFit, most: int, cutoff: float
+    ) -> SurfaceFit:  # fmt: skip
+        """Return a fit that goes on from another until it changes by little."""
+        for _ in range(ROUNDS):
+            before = fit
+            fit = self._fit(sight, data, _pose_of(fit), most, STEPS[1], cutoff)
+            if _distance(fit, before, before.information) < SETTLED:
+                break
+        return fit
 
-    def _fit_settings(self, one: Expected, seen: CorrectedFrame, window: Window, thinning: float) -> FitSettings:
-        """Return the weights of points that stand for others, of pixels that share their noise in patches."""
-        s = self.settings
-        patch = (seen.camera.depth.correlation / window.stride) ** 2
-        alone = seen.noise == seen.camera.depth.noise
+    def _fit(
+        self, sight: _Sight, data: tuple[Array, Array], start: Array, most: int, steps: int,
+        cutoff: float | None = None,
+    ) -> SurfaceFit:  # fmt: skip
+        """Return a fit to points and what is beyond the outline.
+
+        Args:
+            sight: What is fitted.
+            data: Points, shape (N, 3) [m], and distances beyond what may be covered, shape (h, w) [pixels].
+            start: Pose to start from in the optical frame, shape (4, 4) [m].
+            most: Number of points that are used at most.
+            steps: Number of steps.
+            cutoff: Residual from which points do not count [m]; by default one that becomes narrower.
+        """
+        one, (points, beyond), s = sight.one, data, self.settings
+        kept = points[np.linspace(0, len(points) - 1, min(len(points), most)).astype(np.int64)]
+        alone = sight.seen.noise == sight.seen.camera.depth.noise
         inflation = one.inflation[0 if alone else 1]
-        return FitSettings(
-            noise=seen.noise, floor=s.floor, edge=s.edge,
-            point_share=s.point_share * thinning / max(1.0, patch) / inflation,
-            contour_share=s.contour_share * (ALONE if alone else 1.0) * window.stride / inflation, first=0.03, last=LAST, reach=0.02, steps=STEPS[0],
+        contour = s.contour_share * (ALONE if alone else 1.0) * sight.window.stride / inflation
+        settings = FitSettings(
+            noise=sight.seen.noise, floor=s.floor, edge=s.edge,
+            point_share=self._share(sight, points) / max(1, len(kept)), contour_share=contour,
+            first=cutoff or FIRST, last=cutoff or LAST, reach=REACH, steps=steps,
         )  # fmt: skip
+        return fit_surface(
+            np.vstack([kept, OUTSIDE]), beyond, sight.lens, one.surface.vertices, one.surface.faces, one.ties,
+            one.symmetry, start, sight.expected, sight.prior, settings, len(kept),
+        )  # fmt: skip
+
+    def _share(self, sight: _Sight, points: Array) -> float:
+        """Return the number of independent measurements that points are, of which pixels share their noise in patches."""
+        patch = (sight.seen.camera.depth.correlation / sight.window.stride) ** 2
+        inflation = sight.one.inflation[0 if sight.seen.noise == sight.seen.camera.depth.noise else 1]
+        return self.settings.point_share * len(points) / max(1.0, patch) / inflation
 
     def _starts(self, one: Expected, expected: Array, registration: Registration) -> list[Array]:
         """Return the poses to start from, in the optical frame: turned about the axis about which grasps vary most."""
@@ -472,15 +520,6 @@ def _pose_of(fit: SurfaceFit) -> Array:
     return pose
 
 
-def _outlined(points: Array) -> Array:
-    """Return points and one outside of the image, the first of those that are the outline's.
-
-    With these the contour resists where it touches what it must not cover. Otherwise steps overshoot there: pixels
-    that are covered count, but not those that are covered after a step.
-    """
-    return np.vstack([points, OUTSIDE])
-
-
 def _different(fits: Sequence[SurfaceFit], prior: Array) -> list[SurfaceFit]:
     """Return the fits that are not the same as a better one, nor much worse than the best, the best first."""
     found: list[SurfaceFit] = []
@@ -494,9 +533,14 @@ def _different(fits: Sequence[SurfaceFit], prior: Array) -> list[SurfaceFit]:
 
 def _same(fit: SurfaceFit, other: SurfaceFit, prior: Array) -> bool:
     """Whether two fits differ by little of what was measured, or of what grasps vary by."""
+    told = _distance(fit, other, other.information[:6, :6] - prior)
+    return told < SAME_FIT[0] or _distance(fit, other, prior) < SAME_FIT[1]
+
+
+def _distance(fit: SurfaceFit, other: SurfaceFit, information: Array) -> float:
+    """Return the squared difference of the poses of two fits by an information matrix."""
     off = np.concatenate([pin.log3(fit.rotation @ other.rotation.T), fit.position - other.position])
-    told = other.information[:6, :6] - prior
-    return float(off @ told @ off) < SAME_FIT[0] or float(off @ prior @ off) < SAME_FIT[1]
+    return float(off @ information[:6, :6] @ off)
 
 
 def _blocked(
