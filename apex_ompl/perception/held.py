@@ -10,7 +10,7 @@ cost.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -39,8 +39,8 @@ from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
 INFLATION = {
-    "box": (1.50, 0.56), "cylinder": (1.05, 0.56), "capsule": (1.05, 0.56), "slender": (1.10, 0.52),
-    "sphere": (1.02, 0.62), "mesh": (1.40, 0.68), "thin mesh": (1.06, 0.59),
+    "box": (1.50, 0.58), "cylinder": (1.05, 0.56), "capsule": (1.05, 0.56), "slender": (1.10, 0.52),
+    "sphere": (1.02, 0.64), "mesh": (1.40, 0.68), "thin mesh": (1.06, 0.64),
 }  # fmt: skip
 """Factors of the variances of measurements by shape: of one frame, and of means of frames, without flying pixels.
 
@@ -92,6 +92,7 @@ class HeldSettings:
         contour_share: Independent measurements for each pixel of the contour.
         starts: Turns about the axis of the grasp that varies most, from which fits start [degrees].
         most_points: Points that are used at most.
+        first_points: Points that fits from the starts use at most.
         least_points: Pixels without which there is no answer.
         least_seen: Share of the expected outline without which there is no answer.
         most_misfit: Mean squared error of points over that of noise above which there is no answer.
@@ -129,6 +130,7 @@ class HeldSettings:
             "point_share",
             "contour_share",
             "most_points",
+            "first_points",
             "least_points",
             "most_misfit",
         ):
@@ -255,6 +257,26 @@ class _Sight(NamedTuple):
     lens: Array
     expected: Array
     prior: Array
+
+
+class _Data(NamedTuple):
+    """What a fit is made to.
+
+    Attributes:
+        points: Points of the object in the optical frame, shape (N, 3) [m].
+        beyond: Distances of pixels from those that it may cover, shape (h, w) [pixels].
+        stands_for: Number of points that each of them stands for.
+    """
+
+    points: Array
+    beyond: Array
+    stands_for: float = 1.0
+
+    def at_most(self, count: int) -> _Data:
+        """Return the same with this number of points at most."""
+        n = len(self.points)
+        kept = self.points[np.linspace(0, n - 1, min(n, count)).astype(np.int64)]
+        return _Data(kept, self.beyond, n / max(1, len(kept)))
 
 
 class Expected(NamedTuple):
@@ -390,10 +412,9 @@ class HeldObjectFinder:
             sizes = np.where(np.isin(range(3), one.ties), s.size_spread**-2, UNKNOWN)
             prior = np.block([[prior, np.zeros((6, 3))], [np.zeros((3, 6)), np.diag(sizes)]])
         sight = _Sight(one, seen, window, own, expected, prior)
-        fits = [
-            self._fit(sight, (points, beyond), start, s.first_points, STEPS[0])
-            for start in self._starts(one, expected, registration)
-        ]
+        data = _Data(points, beyond)
+        fits = [self._fit(sight, data.at_most(s.first_points), start, STEPS[0])
+                for start in self._starts(one, expected, registration)]  # fmt: skip
         best = min(fit.cost for fit in fits)
         if not np.isfinite(best):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
@@ -404,63 +425,59 @@ class HeldObjectFinder:
         local = Window(0, 0, window.width, window.height, 1)
         last = TUKEY * float(np.hypot(noise * center[2] ** 2, s.floor))
         distinct = _different(fits, prior)[:MOST_FITS]
-        wide, refined, data = list[SurfaceFit](), list[SurfaceFit](), list[tuple[Array, Array]]()
+        every, wide = list[_Data](), list[SurfaceFit]()
         for fit in distinct:
-            passable = _blocked(fit, around, robot, near_robot, 2.0 * noise, s.thickness)
-            data.append(
-                select_points(*passable, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness)
-            )
-            wide.append(self._settled(sight, data[-1], fit, s.first_points, LAST))
+            passable = _blocked(fit, (around, robot, near_robot), 2.0 * noise, s.thickness)
+            every.append(_Data(*select_points(
+                *passable, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness
+            )))  # fmt: skip
+            wide.append(self._settled(sight, every[-1].at_most(s.first_points), fit, LAST))
         least = min(fit.cost for fit in wide)
-        for fit, mine in zip(wide, data, strict=True):
-            if fit.cost <= least + UNLIKELY:
-                refined.append(self._settled(sight, mine, fit, s.most_points, last))
-        points = data[0][0]
+        refined = [
+            self._settled(sight, mine.at_most(s.most_points), fit, last)
+            for fit, mine in zip(wide, every, strict=True) if fit.cost <= least + UNLIKELY
+        ]  # fmt: skip
+        points = every[0].points
         region = _Region(window, prior, self._share(sight, points), count)
         return self._answer(one, refined, seen, region)
 
-    def _settled(
-        self, sight: _Sight, data: tuple[Array, Array], fit: SurfaceFit, most: int, cutoff: float
-    ) -> SurfaceFit:  # fmt: skip
+    def _settled(self, sight: _Sight, data: _Data, fit: SurfaceFit, cutoff: float) -> SurfaceFit:
         """Return a fit that goes on from another until it changes by little."""
         for _ in range(ROUNDS):
             before = fit
-            fit = self._fit(sight, data, _pose_of(fit), most, STEPS[1], cutoff)
+            fit = self._fit(sight, data, _pose_of(fit), STEPS[1], cutoff)
             if _distance(fit, before, before.information) < SETTLED:
                 break
         return fit
 
     def _fit(
-        self, sight: _Sight, data: tuple[Array, Array], start: Array, most: int, steps: int,
-        cutoff: float | None = None,
+        self, sight: _Sight, data: _Data, start: Array, steps: int, cutoff: float | None = None
     ) -> SurfaceFit:  # fmt: skip
-        """Return a fit to points and what is beyond the outline.
+        """Return a fit to points and an outline.
 
         Args:
             sight: What is fitted.
-            data: Points, shape (N, 3) [m], and distances beyond what may be covered, shape (h, w) [pixels].
+            data: What it is fitted to.
             start: Pose to start from in the optical frame, shape (4, 4) [m].
-            most: Number of points that are used at most.
             steps: Number of steps.
             cutoff: Residual from which points do not count [m]; by default one that becomes narrower.
         """
-        one, (points, beyond), s = sight.one, data, self.settings
-        kept = points[np.linspace(0, len(points) - 1, min(len(points), most)).astype(np.int64)]
+        one, s = sight.one, self.settings
         alone = sight.seen.noise == sight.seen.camera.depth.noise
         inflation = one.inflation[0 if alone else 1]
-        contour = s.contour_share * (ALONE if alone else 1.0) * sight.window.stride / inflation
         settings = FitSettings(
             noise=sight.seen.noise, floor=s.floor, edge=s.edge,
-            point_share=self._share(sight, points) / max(1, len(kept)), contour_share=contour,
+            point_share=data.stands_for * self._share(sight, data.points) / max(1, len(data.points)),
+            contour_share=s.contour_share * (ALONE if alone else 1.0) * sight.window.stride / inflation,
             first=cutoff or FIRST, last=cutoff or LAST, reach=REACH, steps=steps,
         )  # fmt: skip
         return fit_surface(
-            np.vstack([kept, OUTSIDE]), beyond, sight.lens, one.surface.vertices, one.surface.faces, one.ties,
-            one.symmetry, start, sight.expected, sight.prior, settings, len(kept),
+            np.vstack([data.points, OUTSIDE]), data.beyond, sight.lens, one.surface.vertices, one.surface.faces,
+            one.ties, one.symmetry, start, sight.expected, sight.prior, settings, len(data.points),
         )  # fmt: skip
 
     def _share(self, sight: _Sight, points: Array) -> float:
-        """Return the number of independent measurements that points are, of which pixels share their noise in patches."""
+        """Return the number of independent measurements of points, as pixels share their noise in patches."""
         patch = (sight.seen.camera.depth.correlation / sight.window.stride) ** 2
         inflation = sight.one.inflation[0 if sight.seen.noise == sight.seen.camera.depth.noise else 1]
         return self.settings.point_share * len(points) / max(1.0, patch) / inflation
@@ -544,22 +561,22 @@ def _distance(fit: SurfaceFit, other: SurfaceFit, information: Array) -> float:
 
 
 def _blocked(
-    fit: SurfaceFit, measured: Array, robot: Array, near_robot: Array, noise: float, slack: float
+    fit: SurfaceFit, depths: tuple[Array, Array, Array], noise: float, slack: float
 ) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Return measured and expected depths, what an object would hide, and so cannot cover, far away and not the robot's.
+    """Return depths of which those that an object would hide, and so cannot cover, are far away and no robot's.
 
     Args:
         fit: Where the object is.
-        measured: Depths in the window, shape (h, w) [m].
-        robot: Expected depths of the robot there, infinite where there is none [m].
-        near_robot: The same of a robot that is thicker all around.
+        depths: Measured depths in the window, and those expected of the robot and of a thicker one, infinite where
+            there is none, shape (h, w) each [m].
         noise: Largest error of depth z over z^2 [1/m].
         slack: Difference of depths that may be an error beside it [m].
     """
+    measured, robot, near_robot = depths
     allowed = slack + noise * measured**2
     own = ((measured > near_robot - allowed) & (measured < robot + allowed)) | (np.abs(measured - near_robot) < allowed)
     if not own.any():
-        return measured, robot, near_robot
+        return depths
     depth = np.where(fit.triangle >= 0, fit.depth, np.inf)
     for _ in range(SPREAD_PIXELS):
         wider = np.full((depth.shape[0] + 2, depth.shape[1] + 2), np.inf)
