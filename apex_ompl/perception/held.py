@@ -45,7 +45,7 @@ INFLATION = {
 """Factors of the variances of measurements by shape: of one frame, and of means of frames, without flying pixels.
 
 They make mean normalized squared errors those of chi-squared on scenes of their own (``python -m
-benchmarks.perception.held --calibrate``).
+benchmarks.perception.held --calibrate``, which prints those to take).
 """
 SLENDER = 0.3  # radius over half length of cylinders and capsules below which they are slender
 THIN = 0.5  # share of the volume of its hull below which a mesh is thin
