@@ -26,12 +26,6 @@ from apex_ompl.types import Array
 CAMERA = 7  # errors of a camera: turn, shift, scale of depths
 MEASURED = 0.95  # share of the grasp's variance below which a look has measured a direction
 ROUNDS = 3  # of the linearization of turns
-SHARED = 1.43
-"""Factor of fused variances, for errors of surfaces and fingers that all looks have in common.
-
-It makes mean normalized squared errors those of chi-squared on scenes of their own (``python -m
-benchmarks.perception.looking --tune``).
-"""
 LARGE = 1.5  # mean squared difference of looks above which their covariances are too small
 APART = 4.0  # mean squared difference of looks over what their covariances explain above which one is wrong
 
@@ -114,7 +108,7 @@ def _fused(answers: Sequence[Sighting], spread: Array) -> tuple[Array, Array, fl
         rows = [_rows(one, pose, expected, spread) for one in answers]
         solution, information, excess = _solved(rows, cameras, len(names), expected)
         pose = _shifted(pose, spread * solution)
-    growth = SHARED * (excess if excess > LARGE else 1.0)
+    growth = excess if excess > LARGE else 1.0
     covariance = np.asarray(np.linalg.inv(information)[:6, :6] * np.outer(spread, spread) * growth, float)
     return pose, covariance, excess
 

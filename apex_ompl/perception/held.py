@@ -39,21 +39,39 @@ from apex_ompl.types import Array, Indices
 from apex_ompl.util.validation import check_number, check_positive
 
 INFLATION = {
-    "box": (1.19, 0.93), "cylinder": (0.83, 0.55), "capsule": (0.83, 0.55), "slender": (0.66, 0.31),
-    "sphere": (0.96, 0.68), "mesh": (1.45, 0.76), "thin mesh": (1.17, 0.67),
+    "box": (1.50, 0.58), "cylinder": (1.05, 0.56), "capsule": (1.05, 0.56), "slender": (1.10, 0.52),
+    "sphere": (1.02, 0.64), "mesh": (1.40, 0.68), "thin mesh": (1.06, 0.64),
 }  # fmt: skip
 """Factors of the variances of measurements by shape: of one frame, and of means of frames, without flying pixels.
 
 They make mean normalized squared errors those of chi-squared on scenes of their own (``python -m
-benchmarks.perception.held --calibrate``).
+benchmarks.perception.held --calibrate``, which prints those to take).
 """
 SLENDER = 0.3  # radius over half length of cylinders and capsules below which they are slender
 THIN = 0.5  # share of the volume of its hull below which a mesh is thin
 ROUND, LEAST_RING = 1e-3, 12  # of vertices on rings: share of the radius in which they agree, and their least number
-MISFIT, GROWTH = 1.2, 1.5  # mean squared error of points over that of noise above which variances grow, and its power
+MISFIT, GROWTH = 1.0, 1.5  # mean squared error of points over that of noise above which variances grow, and its power
 SAME = 0.02  # difference from the measured depth within which a surface was measured [m]
 FARTHER = 0.04  # by which a depth lies behind a surface that is not there [m]
 NOT_THERE = "no surface is seen where the hand holds it"
+ALONE = 0.33  # share of the contour's measurements in one frame, in which depths at edges are missing
+STEPS = 4, 3  # from each start, and in a round of what was found from there
+ROUNDS = 3  # at most
+SETTLED = 0.3  # squared change in a round, in units of its covariance, below which a fit has settled
+TUKEY = 3.3  # standard deviations of a point from which it does not count in the end
+LAST = 0.018  # residual from which points do not count in fits from the starts [m]
+SAME_FIT = 9.0, 0.1  # squared difference of fits in units of their own and of grasps' spread within which they are one
+HOPELESS = 60.0, 1.3  # cost above which a fit is not refined, and its part that grows with that of the best one
+MOST_FITS, UNLIKELY = 2, 20.0  # fits that are refined, and difference of costs from which the worse one is not
+FIRST, REACH = 0.03, 0.02  # residuals from which points at the first step, and contours, do not count [m]
+SPREAD_PIXELS = 4  # around a drawing to which its depths are extended
+OUTSIDE = (-1e3, 0.0, 1e2)
+"""A point of the outline that no image shows [m].
+
+With one the contour resists where it touches what it must not cover. Otherwise steps overshoot there, as only those
+pixels count that are covered already, and fits swing to and fro by several pixels.
+"""
+FAR_AWAY = 100.0  # depth behind everything [m]
 FARTHEST = 36.0  # squared error of six dimensions that a grasp exceeds three times in a million
 UNKNOWN = 1e6  # information of what is known [1/unit^2]
 
@@ -74,6 +92,7 @@ class HeldSettings:
         contour_share: Independent measurements for each pixel of the contour.
         starts: Turns about the axis of the grasp that varies most, from which fits start [degrees].
         most_points: Points that are used at most.
+        first_points: Points that fits from the starts use at most.
         least_points: Pixels without which there is no answer.
         least_seen: Share of the expected outline without which there is no answer.
         most_misfit: Mean squared error of points over that of noise above which there is no answer.
@@ -85,11 +104,12 @@ class HeldSettings:
     registration: RegistrationSettings | None = field(default_factory=RegistrationSettings)
     thickness: float = 0.005
     floor: float = 0.0005
-    edge: float = 0.4
+    edge: float = 0.3
     point_share: float = 1.4
     contour_share: float = 0.15
     starts: tuple[float, ...] = (0.0, -18.0, 18.0)
-    most_points: int = 300
+    most_points: int = 450
+    first_points: int = 150
     least_points: int = 60
     least_seen: float = 0.2
     most_misfit: float = 10.0
@@ -110,6 +130,7 @@ class HeldSettings:
             "point_share",
             "contour_share",
             "most_points",
+            "first_points",
             "least_points",
             "most_misfit",
         ):
@@ -210,14 +231,52 @@ class _Region(NamedTuple):
         prior: Information before, shape (6, 6) or (9, 9).
         share: Independent measurements, over all points.
         pixels: Number of pixels that may be the object's.
-        outliers: Mean squared error over that of noise where half of the points are on no surface.
     """
 
     window: Window
     prior: Array
     share: float
     pixels: int
-    outliers: float
+
+
+class _Sight(NamedTuple):
+    """An object in a frame.
+
+    Attributes:
+        one: The object.
+        seen: The frame.
+        window: Part of the image.
+        lens: Lens of the window.
+        expected: Pose in the optical frame that the grasp gives, shape (4, 4) [m].
+        prior: Information before, shape (6, 6) or (9, 9).
+    """
+
+    one: Expected
+    seen: CorrectedFrame
+    window: Window
+    lens: Array
+    expected: Array
+    prior: Array
+
+
+class _Data(NamedTuple):
+    """What a fit is made to.
+
+    Attributes:
+        points: Points of the object in the optical frame, shape (N, 3) [m].
+        beyond: Distances of pixels from those that it may cover, shape (h, w) [pixels].
+        stands_for: Number of points that each of them stands for.
+    """
+
+    points: Array
+    beyond: Array
+    stands_for: float = 1.0
+
+    def at_most(self, count: int) -> _Data:
+        """Return the same with this number of points at most."""
+        n = len(self.points)
+        kept = self.points[np.linspace(0, n - 1, min(n, count)).astype(np.int64)]
+        return _Data(kept, self.beyond, n / max(1, len(kept)))
 
 
 class Expected(NamedTuple):
@@ -348,31 +407,80 @@ class HeldObjectFinder:
         if count < s.least_points:
             around = measured[_cells(window)]
             return _without(one, _nothing_seen(one.body.name, around, robot, center[2] - radius), count)
-        kept = points[np.linspace(0, len(points) - 1, min(len(points), s.most_points)).astype(np.int64)]
-        settings = self._fit_settings(one, seen, window, len(points) / len(kept))
         prior = np.asarray(np.linalg.inv(turned(one.covariance, registration.pose[:3, :3].T)), float)
         if s.size_spread > 0.0:
             sizes = np.where(np.isin(range(3), one.ties), s.size_spread**-2, UNKNOWN)
             prior = np.block([[prior, np.zeros((6, 3))], [np.zeros((3, 6)), np.diag(sizes)]])
-        fits = [
-            fit_surface(kept, beyond, own, one.surface.vertices, one.surface.faces, one.ties, one.symmetry, start,
-                        expected, prior, settings)
-            for start in self._starts(one, expected, registration)
+        sight = _Sight(one, seen, window, own, expected, prior)
+        data = _Data(points, beyond)
+        fits = [self._fit(sight, data.at_most(s.first_points), start, STEPS[0])
+                for start in self._starts(one, expected, registration)]  # fmt: skip
+        best = min(fit.cost for fit in fits)
+        if not np.isfinite(best):
+            return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
+        outliers = 0.5 / 3.0 * (LAST / (noise * center[2] ** 2 + s.floor)) ** 2  # half of the points, by Tukey's loss
+        if best > max(s.most_misfit, outliers) * self._share(sight, points):
+            return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
+        around = np.ascontiguousarray(measured[_cells(window)])
+        local = Window(0, 0, window.width, window.height, 1)
+        last = TUKEY * float(np.hypot(noise * center[2] ** 2, s.floor))
+        distinct = _different(fits, prior)[:MOST_FITS]
+        every, wide = list[_Data](), list[SurfaceFit]()
+        for fit in distinct:
+            passable = _blocked(fit, (around, robot, near_robot), 2.0 * noise, s.thickness)
+            every.append(_Data(*select_points(
+                *passable, local, own, distinct[0].position, radius, 2.0 * noise, s.thickness
+            )))  # fmt: skip
+            wide.append(self._settled(sight, every[-1].at_most(s.first_points), fit, LAST))
+        least = min(fit.cost for fit in wide)
+        refined = [
+            self._settled(sight, mine.at_most(s.most_points), fit, last)
+            for fit, mine in zip(wide, every, strict=True) if fit.cost <= least + UNLIKELY
         ]  # fmt: skip
-        outliers = 0.5 / 3.0 * (settings.last / (noise * center[2] ** 2 + s.floor)) ** 2  # by Tukey's loss
-        region = _Region(window, prior, settings.point_share * len(kept), count, float(outliers))
-        return self._answer(one, fits, seen, region)
+        points = every[0].points
+        region = _Region(window, prior, self._share(sight, points), count)
+        return self._answer(one, refined, seen, region)
 
-    def _fit_settings(self, one: Expected, seen: CorrectedFrame, window: Window, thinning: float) -> FitSettings:
-        """Return the weights of points that stand for others, of pixels that share their noise in patches."""
-        s = self.settings
-        patch = (seen.camera.depth.correlation / window.stride) ** 2
-        inflation = one.inflation[0 if seen.noise == seen.camera.depth.noise else 1]
-        return FitSettings(
-            noise=seen.noise, floor=s.floor, edge=s.edge,
-            point_share=s.point_share * thinning / max(1.0, patch) / inflation,
-            contour_share=s.contour_share * window.stride / inflation, first=0.03, last=0.018, reach=0.02, steps=8,
+    def _settled(self, sight: _Sight, data: _Data, fit: SurfaceFit, cutoff: float) -> SurfaceFit:
+        """Return a fit that goes on from another until it changes by little."""
+        for _ in range(ROUNDS):
+            before = fit
+            fit = self._fit(sight, data, _pose_of(fit), STEPS[1], cutoff)
+            if _distance(fit, before, before.information) < SETTLED:
+                break
+        return fit
+
+    def _fit(
+        self, sight: _Sight, data: _Data, start: Array, steps: int, cutoff: float | None = None
+    ) -> SurfaceFit:  # fmt: skip
+        """Return a fit to points and an outline.
+
+        Args:
+            sight: What is fitted.
+            data: What it is fitted to.
+            start: Pose to start from in the optical frame, shape (4, 4) [m].
+            steps: Number of steps.
+            cutoff: Residual from which points do not count [m]; by default one that becomes narrower.
+        """
+        one, s = sight.one, self.settings
+        alone = sight.seen.noise == sight.seen.camera.depth.noise
+        inflation = one.inflation[0 if alone else 1]
+        settings = FitSettings(
+            noise=sight.seen.noise, floor=s.floor, edge=s.edge,
+            point_share=data.stands_for * self._share(sight, data.points) / max(1, len(data.points)),
+            contour_share=s.contour_share * (ALONE if alone else 1.0) * sight.window.stride / inflation,
+            first=cutoff or FIRST, last=cutoff or LAST, reach=REACH, steps=steps,
         )  # fmt: skip
+        return fit_surface(
+            np.vstack([data.points, OUTSIDE]), data.beyond, sight.lens, one.surface.vertices, one.surface.faces,
+            one.ties, one.symmetry, start, sight.expected, sight.prior, settings, len(data.points),
+        )  # fmt: skip
+
+    def _share(self, sight: _Sight, points: Array) -> float:
+        """Return the number of independent measurements of points, as pixels share their noise in patches."""
+        patch = (sight.seen.camera.depth.correlation / sight.window.stride) ** 2
+        inflation = sight.one.inflation[0 if sight.seen.noise == sight.seen.camera.depth.noise else 1]
+        return self.settings.point_share * len(points) / max(1.0, patch) / inflation
 
     def _starts(self, one: Expected, expected: Array, registration: Registration) -> list[Array]:
         """Return the poses to start from, in the optical frame: turned about the axis about which grasps vary most."""
@@ -392,9 +500,7 @@ class HeldObjectFinder:
         best = min(fits, key=lambda fit: fit.cost)
         if not np.isfinite(best.cost):
             return _without(one, f"{one.body.name!r}: the fit to {count} pixels found no pose", count)
-        misfit = best.cost / region.share
-        if misfit > max(self.settings.most_misfit, region.outliers):
-            return _without(one, f"{one.body.name!r}: what is seen in the hand has another shape", count)
+        misfit = best.cost / max(region.share, 1e-9)
         factor = max(1.0, misfit / MISFIT) ** GROWTH  # of the variances of measurements
         n = len(best.information)
         covariance: Array = np.zeros((n, n))
@@ -410,8 +516,7 @@ class HeldObjectFinder:
             away[:3] = pin.log3(fit.rotation @ best.rotation.T)
             away[3:6] = fit.position - best.position
             covariance = covariance + weight * (own + lever @ registration.covariance @ lever.T + np.outer(away, away))
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = best.rotation, best.position
+        pose = _pose_of(best)
         share, missed = _measured_shares(best, seen.depth[_cells(region.window)])
         if missed > share:
             return _without(one, f"{one.body.name!r}: {NOT_THERE}", count)
@@ -423,6 +528,67 @@ class HeldObjectFinder:
             return _without(one, f"{one.body.name!r}: what is seen is not where the hand holds it", count)
         lever = np.kron(np.eye(2), registration.pose[:3, :3]) @ common[:6]
         return HeldObject(one.body, "", found, world, best.scale, size, share, count, misfit, lever)
+
+
+def _pose_of(fit: SurfaceFit) -> Array:
+    """Return the pose of a fit in the optical frame, shape (4, 4) [m]."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = fit.rotation, fit.position
+    return pose
+
+
+def _different(fits: Sequence[SurfaceFit], prior: Array) -> list[SurfaceFit]:
+    """Return the fits that are not the same as a better one, nor much worse than the best, the best first."""
+    found: list[SurfaceFit] = []
+    for fit in sorted(fits, key=lambda one: one.cost):
+        if not np.isfinite(fit.cost) or (found and fit.cost > HOPELESS[0] + HOPELESS[1] * found[0].cost):
+            break
+        if not any(_same(fit, other, prior[:6, :6]) for other in found):
+            found.append(fit)
+    return found
+
+
+def _same(fit: SurfaceFit, other: SurfaceFit, prior: Array) -> bool:
+    """Whether two fits differ by little of what was measured, or of what grasps vary by."""
+    told = _distance(fit, other, other.information[:6, :6] - prior)
+    return told < SAME_FIT[0] or _distance(fit, other, prior) < SAME_FIT[1]
+
+
+def _distance(fit: SurfaceFit, other: SurfaceFit, information: Array) -> float:
+    """Return the squared difference of the poses of two fits by an information matrix."""
+    off = np.concatenate([pin.log3(fit.rotation @ other.rotation.T), fit.position - other.position])
+    return float(off @ information[:6, :6] @ off)
+
+
+def _blocked(
+    fit: SurfaceFit, depths: tuple[Array, Array, Array], noise: float, slack: float
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return depths of which those that an object would hide, and so cannot cover, are far away and no robot's.
+
+    Args:
+        fit: Where the object is.
+        depths: Measured depths in the window, and those expected of the robot and of a thicker one, infinite where
+            there is none, shape (h, w) each [m].
+        noise: Largest error of depth z over z^2 [1/m].
+        slack: Difference of depths that may be an error beside it [m].
+    """
+    measured, robot, near_robot = depths
+    allowed = slack + noise * measured**2
+    own = ((measured > near_robot - allowed) & (measured < robot + allowed)) | (np.abs(measured - near_robot) < allowed)
+    if not own.any():
+        return depths
+    depth = np.where(fit.triangle >= 0, fit.depth, np.inf)
+    for _ in range(SPREAD_PIXELS):
+        wider = np.full((depth.shape[0] + 2, depth.shape[1] + 2), np.inf)
+        wider[1:-1, 1:-1] = depth
+        around = np.minimum(
+            np.minimum(wider[:-2, 1:-1], wider[2:, 1:-1]), np.minimum(wider[1:-1, :-2], wider[1:-1, 2:])
+        )
+        depth = np.where(np.isfinite(depth), depth, around)
+    blocked = own & (measured > depth + allowed)
+    return (
+        np.where(blocked, FAR_AWAY, measured), np.where(blocked, np.inf, robot), np.where(blocked, np.inf, near_robot)
+    )  # fmt: skip
 
 
 def _far_from(one: Expected, pose: Array) -> bool:

@@ -19,7 +19,8 @@ from apex_ompl.util.validation import check_positive, finite_numbers
 
 TOLD = 0.1  # share of a variance that the image has to explain
 STEP = 1e-3  # of joints, for differences [rad; synergies 0..1]
-ROUNDS = ((0.06, 0.03), (0.06, 0.02), (0.05, 0.012), (0.05, 0.012))  # gate and cutoff of residuals [m]
+ROUNDS = (((0.06, 0.03), (0.06, 0.02)), ((0.05, 0.012), (0.05, 0.012)))
+"""Gates and cutoffs of residuals [m], for each drawing of the robot."""
 
 
 @dataclass(frozen=True)
@@ -117,30 +118,33 @@ def register(given: CorrectedFrame, surface: RobotSurface, settings: Registratio
     stride = camera.depth.correlation
     height, width = (-(-n // stride) for n in measured.shape)
     lens = lens_of(camera) / stride
-    unknowns, count = np.zeros(len(spreads)), 0
-    information = prior
-    vertices = surface.seen_from(pose, surface.poses(state))
-    depth, index = draw_triangles(vertices, surface.faces, lens, height, width)
+    unknowns, count, gate = np.zeros(len(spreads)), 0, 0.0
+    information, found, corrected = prior, pose, state
+    vertices = seen = surface.seen_from(pose, surface.poses(state))
     velocities = np.zeros((len(joints), *vertices.shape))
     for k, joint in enumerate(joints):
         moved = state.copy()
         moved[joint] += STEP
         velocities[k] = (surface.seen_from(pose, surface.poses(moved)) - vertices) / STEP
-    drawn = Drawn(vertices, surface.faces, velocities, depth, index, lens, stride)
-    for gate, cutoff in ROUNDS:
-        matrix, vector, count = register_rows(measured, drawn, unknowns, noise, settings.floor, gate, cutoff)
-        information = prior + settings.share * matrix
-        unknowns = unknowns + np.linalg.solve(information, settings.share * vector - prior @ unknowns)
+    limits = surface.robot.limits
+    for number, rounds in enumerate(ROUNDS):
+        if number > 0:  # pixels belong to other triangles after the correction
+            seen = surface.seen_from(found, surface.poses(corrected)) / (1.0 + unknowns[6])
+        depth, index = draw_triangles(seen, surface.faces, lens, height, width)
+        drawn = Drawn(vertices, surface.faces, velocities, depth, index, lens, stride)
+        for gate, cutoff in rounds:
+            matrix, vector, count = register_rows(measured, drawn, unknowns, noise, settings.floor, gate, cutoff)
+            information = prior + settings.share * matrix
+            unknowns = unknowns + np.linalg.solve(information, settings.share * vector - prior @ unknowns)
+        corrected = state.copy()
+        corrected[list(joints)] += unknowns[POSE:]
+        corrected = np.clip(corrected, np.minimum(limits.lower, state), np.maximum(limits.upper, state))
+        found = pose.copy()
+        found[:3, :3] = pose[:3, :3] @ pin.exp3(unknowns[:3])
+        found[:3, 3] = pose[:3, 3] + pose[:3, :3] @ unknowns[3:6]
     sparse = measured[::stride, ::stride]
     apart = int(np.count_nonzero((index >= 0) & (sparse > depth + gate)))
     covariance = np.linalg.inv(information)
-    corrected = state.copy()
-    corrected[list(joints)] += unknowns[POSE:]
-    limits = surface.robot.limits
-    corrected = np.clip(corrected, np.minimum(limits.lower, state), np.maximum(limits.upper, state))
-    found = pose.copy()
-    found[:3, :3] = pose[:3, :3] @ pin.exp3(unknowns[:3])
-    found[:3, 3] = pose[:3, 3] + pose[:3, :3] @ unknowns[3:6]
     surprise, freedoms = _surprise(unknowns[:POSE], np.array(spreads[:POSE]), covariance[:POSE, :POSE])
     return Registration(
         found, 1.0 + float(unknowns[6]), corrected, covariance[:POSE, :POSE], count, apart, surprise, freedoms

@@ -13,7 +13,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.perception import Camera, Frame
 from apex_ompl.perception.camera import DepthErrors
 from apex_ompl.perception.frames import looks_of, mean_frame
-from apex_ompl.perception.fusion import SHARED, Sighting, fused
+from apex_ompl.perception.fusion import Sighting, fused
 from apex_ompl.perception.held import NOT_THERE, HeldObject, HeldSettings
 from apex_ompl.perception.registration import CorrectedFrame, Registration
 from apex_ompl.scene.bodies import AttachedObject
@@ -89,7 +89,7 @@ def test_the_covariance_is_that_of_the_joint_posterior() -> None:
     expected = np.linalg.inv(information)[:6, :6]
     deviations = np.sqrt(np.diag(expected))
     np.testing.assert_allclose(
-        found.covariance / SHARED / np.outer(deviations, deviations), expected / np.outer(deviations, deviations),
+        found.covariance / np.outer(deviations, deviations), expected / np.outer(deviations, deviations),
         atol=1e-3,
     )  # fmt: skip
 
@@ -117,7 +117,7 @@ def test_squared_errors_are_within_the_band_of_chi_squared(registered: bool) -> 
         error = np.linalg.solve(total, vector)
         naive.append(float(error @ total @ error))
     half = 1.96 * np.sqrt(2.0 / (6 * trials))
-    assert abs(SHARED * np.mean(squared) / 6.0 - 1.0) < half + 0.05  # some variances grow where looks differ by chance
+    assert abs(np.mean(squared) / 6.0 - 1.0) < half + 0.05  # some variances grow where looks differ by chance
     if not registered:
         assert np.mean(naive) / 6.0 > 1.0 + 3.0 * half
 
