@@ -1,9 +1,9 @@
 """What is computed once for a robot: pairs of links that need no check, and sphere covers of its links.
 
 Files are written beside the robot file as soon as there is something to write, and name how far they are, so that a
-preparation that was stopped goes on where it was. Covers are made quickly for all links first, then tables of the clearances of
-near links that these leave open; last, the covers of the links that still spoil most proofs are made anew, thoroughly,
-as long as the time lasts.
+preparation that was stopped goes on where it was. Covers are made quickly for all links first, then tables of the
+clearances of near links that these leave open; last, the covers of the links that still spoil most proofs are made
+anew, thoroughly, as long as the time lasts.
 """
 
 from __future__ import annotations
