@@ -41,7 +41,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, is_file
 
 ROUNDING = 1e-9  # by which cells are widened [rad], [m]
-FIRST, LAST = 3, (10, 7, 6)  # levels: 2^n cells along each axis at first, and at last by the number of joints
+FIRST, LAST = 3, (13, 7, 6)  # levels: 2^n cells along each axis at first, and at last by the number of joints
 SHARE = 1 / 3  # of the time that is left, for one table
 SAFE = 1e-6  # by which bounds are lowered [m]
 ENOUGH = 5e-4  # bound with which a cell is not divided further [m]
