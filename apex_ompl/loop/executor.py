@@ -67,6 +67,7 @@ class Executor:
         doing: What the robot did at that prediction: ``going``, ``braking`` or ``standing``.
         braking: The stop that was followed last, or None.
         hastened: When a faster motion was requested last [s].
+        unmeasured: Whether no state of the robot was measured yet, so that it does not start.
     """
 
     context: RunContext
@@ -95,6 +96,7 @@ class Executor:
     doing: str = ""
     braking: Following | None = None
     hastened: float = -math.inf
+    unmeasured: bool = False
 
     def log(self, time: float, kind: str, **data: Any) -> None:
         """Record an event."""
@@ -407,7 +409,7 @@ class Executor:
     def _wants(self, now: float) -> bool:
         """Whether the robot needs another motion."""
         settings = self.context.settings
-        if self.tracker.awaited or self.blind(now):
+        if self.tracker.awaited or self.blind(now) or self.unmeasured:
             return False
         if not settings.monitored:
             return self.route is None

@@ -276,7 +276,8 @@ class Loop:
             now: Time on the caller's clock [s]; it starts at the first step.
             state: The measured positions of the joints, shape (dof,), or None where they are not known now. Where a
                 joint is further than the tolerance from where it should be, and, once there was a state, where none was
-                usable for ``settings.silence``, the robot stops and the run ends.
+                usable for ``settings.silence``, the robot stops and the run ends. Where states are given, it does not
+                start before one is usable.
             stamp: When they were measured [s], by default now. One that does not increase is not usable.
 
         Raises:
@@ -350,6 +351,8 @@ class Loop:
                 self.abort(f"{self.joint_names[k]} is {off[k]:.3g} rad from where it should be")
         elif (state is not None or self._known > -math.inf) and now - max(self._known, 0.0) > self.settings.silence:
             self.abort(f"no state of the robot was usable for {self.settings.silence:g} s")
+        executor = self._control.executor
+        executor.unmeasured = self._known == -math.inf and (state is not None or executor.unmeasured)
 
     def end(self, why: str) -> None:
         """End the run at once for a reason: the robot follows the last command to its end."""

@@ -125,6 +125,29 @@ def test_a_robot_with_a_fault_ends_at_rest_with_a_reason(fault: str, words: str)
     assert np.abs(done.positions[-1] - goal).max() > 0.01
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_a_robot_starts_when_a_state_was_measured(late: bool) -> None:
+    world, robot = world_and_robot(FAR)
+    settings = replace(SETTINGS, silence=0.2)
+    loop = Loop(problems.load(PROBLEM), ByHand(line), settings=settings, process=False, speed=0.3)
+    started = None
+    for k in range(60):
+        time = ZERO + k * settings.period
+        loop.observe(time, [standing(o) for o in world.present(time - ZERO)])
+        q = robot.state(time)
+        if not late or k < 10:
+            q = None if k == 5 else np.full(len(q), np.nan)
+        command = loop.step(time, q)
+        if command is not None:
+            robot.send(command)
+            started = k if started is None and not command.rests else started
+    if late:
+        assert started is not None and started >= 10 and loop.outcome is None
+        return
+    assert started is None and loop.outcome is Outcome.ABORTED
+    assert loop.reason.endswith("no state of the robot was usable for 0.2 s")
+
+
 def test_a_camera_that_stops_stops_the_robot_and_bad_observations_are_refused() -> None:
     world, robot = world_and_robot(FAR)
     settings = replace(SETTINGS, silence=0.3, timeout=3.0)
