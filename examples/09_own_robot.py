@@ -2,7 +2,7 @@
 
 import time
 
-from apex_ompl import LoopSettings, Obstacle, Trajectory, load_problem, load_robot, run
+from apex_ompl import ApexError, LoopSettings, Obstacle, Trajectory, load_problem, load_robot, run
 from apex_ompl.drivers import DriverState
 from apex_ompl.loop import Observation
 
@@ -26,8 +26,8 @@ class Robot:
         """Rest at the start."""
         model = load_robot(problem.robot)
         q = problem.start_state(model.joint_names)
-        self.names, self.limits, self.sent = model.joint_names, model.limits, []
-        self.send(Trajectory([0], [q], [0 * q], [0 * q], self.names), 0.0)
+        self.names, self.limits = model.joint_names, model.limits
+        self.sent = [(0.0, Trajectory([0], [q], [0 * q], [0 * q], self.names))]
 
     def state(self) -> DriverState:
         """Return the measured state: here it is where it should be."""
@@ -37,6 +37,8 @@ class Robot:
 
     def send(self, motion, at: float) -> None:
         """Take a motion in place of what would be done from a time on."""
+        if at < self.time:
+            raise ApexError("the motion comes too late")
         self.sent.append((at, motion))
 
 

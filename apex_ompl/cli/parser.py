@@ -147,7 +147,7 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "--snapshot", action="store_true", help="treat moving obstacles as static at their positions at time 0"
     )
     parser.add_argument(
-        "--leave-contact", type=float, default=0.0, metavar="METRES",
+        "--leave-contact", type=float, default=0.0, metavar="METERS",
         help="depth of contacts at the start that the path may leave, up to 0.001 (default: 0)",
     )  # fmt: skip
     parser.add_argument(
@@ -411,7 +411,7 @@ def _add_robot(commands: Commands[argparse.ArgumentParser]) -> None:
         "touches (default: %(default)s)",
     )  # fmt: skip
     prepare.add_argument(
-        "--margin", type=float, default=0.02, metavar="METRES", help="least distance of such a pair "
+        "--margin", type=float, default=0.02, metavar="METERS", help="least distance of such a pair "
         "(default: %(default)s)",
     )  # fmt: skip
     prepare.add_argument("--seed", type=int, default=0, help="of the states (default: %(default)s)")

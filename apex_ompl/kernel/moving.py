@@ -49,6 +49,10 @@ class LimitArrays(NamedTuple):
         """Return the limits of an object with these attributes as contiguous arrays."""
         return cls(*(compact(getattr(limits, name)) for name in cls._fields))
 
+    def scaled(self, share: float) -> LimitArrays:
+        """Return the same limits with a share of the accelerations and jerks."""
+        return self._replace(acceleration=share * self.acceleration, jerk=share * self.jerk)
+
 
 class OpenMoment(NamedTuple):
     """First moment of a motion that is not proved.

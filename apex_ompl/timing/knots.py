@@ -132,12 +132,12 @@ def refitted(states: Array, times: Array, window: float, bounds: Array | None = 
     speed, place = integrals(a)
     missing = gains(np.diff(v, axis=0) - speed, np.diff(q, axis=0) - h * v[:-1] - place)
     tau = (since / length)[:, None]
-    even, turn = tau * (1.0 - tau), 1.0 - 2.0 * tau
+    even = tau * (1.0 - tau)
     even[ends] = 0.0
     if bounds is not None:
         room = (1.0 - np.abs(a) / np.maximum(bounds, np.finfo(float).tiny)) / NEAR_BOUND
         even = even * np.clip(room, LEAST_WEIGHT, 1.0)
-    odd = even * turn
+    odd = even * (1.0 - 2.0 * tau)
     (a11, a21), (a12, a22) = gains(*integrals(even)), gains(*integrals(odd))
     determinant = a11 * a22 - a12 * a21
     c1 = (missing[0] * a22 - missing[1] * a12) / determinant

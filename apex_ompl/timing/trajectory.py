@@ -46,8 +46,8 @@ RATES = (10, 20, 25, 40, 50, 100, 125, 200, 250, 400, 500, 1000)  # that are off
 SAME_STATE = 1e-6  # largest difference of states where motions are joined [rad/s^k]
 STOP_DEVIATION = 1e-3  # of a stop from the path [rad]
 MERGED_EXCESS = 1e-8  # share over a limit with merged knots, at which no longer windows are tried
-STOP_SHARE = 1.0 - 9e-7  # of the limits, for a stop along a path; motions use 1e-6 less than all
-STOP_SHARES = (1.0, 0.99, 0.97, 0.9)  # of the limits, for a stop joint by joint whose knots are merged
+PATH_STOP_SHARES = (1.0 - 9e-7, 1.0)  # of the limits, for a stop along a path: motions leave 1e-6, or nothing
+JOINT_STOP_SHARES = (1.0, 0.99, 0.97, 0.9)  # of the limits, for a stop joint by joint whose knots are merged
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,21 +397,19 @@ class Trajectory:
         if self.velocities[-1].any() or self.accelerations[-1].any():
             return self._joint_stop(time, limits)
         states, bounds = np.stack([self.positions, self.velocities, self.accelerations]), LimitArrays.of(limits)
-        room = bounds._replace(acceleration=STOP_SHARE * bounds.acceleration, jerk=STOP_SHARE * bounds.jerk)
-        found = stop_on_path(self.times, states, time, room, STOP_DEVIATION) or stop_on_path(
-            self.times, states, time, bounds, STOP_DEVIATION
-        )
-        if found is None:
-            return self
-        return joined([self.before(time), Trajectory.unchecked(found[0], found[1], self.joint_names)]).merged()
+        for share in PATH_STOP_SHARES:
+            found = stop_on_path(self.times, states, time, bounds.scaled(share), STOP_DEVIATION)
+            if found is not None:
+                stop = Trajectory.unchecked(found[0], found[1], self.joint_names)
+                return joined([self.before(time), stop]).merged()
+        return self
 
     def _joint_stop(self, time: float, limits: Limits) -> Trajectory:
         """Return the motion up to a time, and then the soonest stop of each joint by itself."""
         head, made = self.before(time), self
         bounds, now = LimitArrays.of(limits), self.states(np.array([time]))[:, 0]
-        for share in STOP_SHARES:  # with room for the merging
-            room = bounds._replace(acceleration=share * bounds.acceleration, jerk=share * bounds.jerk)
-            times, knots, beyond = stop_joints(now[0], now[1], now[2], room)
+        for share in JOINT_STOP_SHARES:  # with room for the merging
+            times, knots, beyond = stop_joints(now[0], now[1], now[2], bounds.scaled(share))
             if beyond.any():
                 break
             made = joined([head, Trajectory.unchecked(times.copy(), knots.copy(), self.joint_names)]).merged()
