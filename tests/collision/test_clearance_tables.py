@@ -198,13 +198,18 @@ def test_a_budget_of_no_time_makes_no_tables_and_reports_tell_what_was_found(bar
     reports: list[TableReport] = []
     assert make_clearances(bare, 0.0, reports.append) == {}
     assert all(not report.complete for report in reports)
-    found = make_clearances(bare, 60.0, reports.append)
+    make_clearances(bare, 60.0, reports.append)
     last = reports[-1]
     assert last.complete
     assert 0.0 < last.proved <= 1.0
     assert " of the range proved" in str(last)
-    again: list[TableReport] = []
-    assert make_clearances(bare, 60.0, again.append, known=found) == found
+
+
+def test_a_second_preparation_keeps_the_tables_of_the_first(folder: Path) -> None:
+    file, again = clearance_file(robot_of(folder, "tabled")), list[TableReport]()
+    first = file.read_bytes()
+    assert prepare_clearances(robot_of(folder, "tabled"), progress=again.append) == file
+    assert file.read_bytes() == first
     assert not again
 
 
