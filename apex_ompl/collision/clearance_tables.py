@@ -138,7 +138,7 @@ def _cells_in_file(robot: Robot) -> dict[str, Cells]:
     return read_clearances(path) if is_file(path) else {}
 
 
-def clearance_keys(robot: Robot) -> dict[str, str]:
+def clearance_digests(robot: Robot) -> dict[str, str]:
     """Return a digest of each table in a robot's file, by the digests of their pairs; none without a file.
 
     Raises:

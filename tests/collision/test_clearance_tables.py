@@ -228,6 +228,17 @@ def test_a_file_gets_what_it_lacks_and_loses_what_is_of_another_robot(tmp_path: 
     assert all((found[key] == whole[key]).all() for key in whole)
 
 
+def test_a_file_with_other_cells_replaces_tables_that_are_kept(folder: Path, tmp_path: Path) -> None:
+    file, proved = write_arm(tmp_path), []
+    cells = read_clearances(clearance_file(robot_of(folder, "tabled")))
+    for some in (cells, {key: 0 * one for key, one in cells.items()}):
+        write_clearances(clearance_file(load_robot(str(file))), some)
+        robot = load_robot(str(file))
+        states = robot.random_state(np.random.default_rng(6), 200)
+        proved.append((CollisionChecker(robot).kernel.unproved(states)[1] == 0).mean())
+    assert proved[0] > proved[1]
+
+
 @pytest.mark.parametrize("cells", [np.zeros(3, np.uint8), np.zeros(4), np.zeros((4, 2), np.uint8), np.uint8(1)])
 def test_files_with_other_content_are_refused(tmp_path: Path, cells: np.ndarray) -> None:
     path = tmp_path / "a.clearances.npz"
