@@ -169,7 +169,12 @@ def clearances_of(
         return {}
     if robot not in _tables:
         near = near_pairs(robot, tree, solids, ((pair.first, pair.second) for pair in robot.geometry.collisionPairs))
-        _tables[robot] = {pair.links: table_of(robot, pair, cells[pair.key]) for pair in near if pair.key in cells}
+        near = [pair for pair in near if pair.key in cells]
+        for pair in near:
+            if cells[pair.key].ndim != len(pair.sources):
+                expected = f"expected {len(pair.sources)} axes, one for each joint"
+                raise FileFormatError(str(clearance_file(robot)), pair.key, cells[pair.key].shape, expected)
+        _tables[robot] = {pair.links: table_of(robot, pair, cells[pair.key]) for pair in near}
     known = _tables[robot]
     return {pair: known[pair] for pair in pairs if pair in known}
 

@@ -247,6 +247,14 @@ def test_files_with_other_content_are_refused(tmp_path: Path, cells: np.ndarray)
         read_clearances(path)
 
 
+def test_a_table_with_another_number_of_axes_than_joints_is_refused(folder: Path, tmp_path: Path) -> None:
+    robot = load_robot(str(write_arm(tmp_path)))
+    cells = read_clearances(clearance_file(robot_of(folder, "tabled")))
+    write_clearances(clearance_file(robot), {key: np.zeros(8, np.uint8) for key in cells})
+    with pytest.raises(FileFormatError, match=r"expected \d axes, one for each joint"):
+        assert CollisionChecker(robot).kernel
+
+
 def test_the_robot_of_the_tables_is_planned_for_with_them(tabled: Robot) -> None:
     conservative.forget_tables(tabled)
     arrays = CollisionChecker(tabled).kernel.robot.arrays
