@@ -177,12 +177,3 @@ def clearances_of(
         _tables[robot] = {pair.links: table_of(robot, pair, cells[pair.key]) for pair in near}
     known = _tables[robot]
     return {pair: known[pair] for pair in pairs if pair in known}
-
-
-def keep_clearances(robot: Robot, cells: Mapping[str, Cells]) -> None:
-    """Use these tables for a robot instead of those in its file; checkers that were made before stay as they are.
-
-    New ones use them from :func:`apex_ompl.collision.conservative.forget_tables` on.
-    """
-    _cells_in_file.keep(robot, dict(cells))
-    _tables.pop(robot, None)

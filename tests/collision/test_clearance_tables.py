@@ -11,7 +11,7 @@ import pytest
 from near_links import write_arm
 
 from apex_ompl import load_robot
-from apex_ompl.collision import CollisionChecker, clearance_tables, conservative
+from apex_ompl.collision import CollisionChecker, clearance_tables
 from apex_ompl.collision.clearance_making import TableMaker, TableReport, make_clearances, prepare_clearances
 from apex_ompl.collision.clearance_tables import clearance_file, near_pairs, read_clearances, table_of, write_clearances
 from apex_ompl.collision.solids import transform
@@ -256,6 +256,5 @@ def test_a_table_with_another_number_of_axes_than_joints_is_refused(folder: Path
 
 
 def test_the_robot_of_the_tables_is_planned_for_with_them(tabled: Robot) -> None:
-    conservative.forget_tables(tabled)
     arrays = CollisionChecker(tabled).kernel.robot.arrays
     assert (arrays.bodies_table >= 0).sum() == len(arrays.table_cells) >= 3
