@@ -167,11 +167,14 @@ def _read_text(text: str, file: Path) -> Description:
 
 
 def _name_parts(parts: list[_Part]) -> None:
-    """Give parts their names, and prefixes where names of links or joints collide."""
+    """Give parts their names, and prefixes where names of links, joints, groups or hands collide."""
     letters = ascii_lowercase + ascii_uppercase
     if len(parts) > len(letters):
         raise ParameterError("URDF", f"{len(parts)} of them", f"at most {len(letters)}")
-    names = [{*part.robot.links, *part.robot.joints} for part in parts]
+    names = [
+        {*part.robot.links, *part.robot.joints, *(name for arm in part.arms for name in (arm.group, arm.hand))}
+        for part in parts
+    ]
     common = any(names[i] & names[j] for i in range(len(names)) for j in range(i))
     for k, part in enumerate(parts):
         part.name = _part_name(part)
@@ -279,8 +282,7 @@ class _Writer:
         self.data["locked"] |= {prefix + joint: value for joint, value in locked.items()}
 
     def _add_arm(self, part: _Part, arm: guesses.Arm) -> None:
-        group = f"{part.prefix}{arm.group}"
-        hand = f"{part.prefix}{arm.hand}" if arm.hand != "hand" or not part.prefix else f"{part.prefix}hand"
+        group, hand = part.prefix + arm.group, part.prefix + arm.hand
         self.data["groups"][group] = [part.prefix + joint for joint in arm.joints]
         self.comments[f"groups.{group}"] = arm.note
         self.notes.append(f"{group}: {arm.note}")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -114,6 +115,21 @@ def test_two_urdfs_stand_in_one_cell_with_names_of_their_sides(tmp_path: Path) -
     assert np.array_equal(robot.home[:4], robot.home[4:])
     three = new_robot(sources_of([urdf] * 3, [], [(k, 0, 0, 0) for k in range(3)]), tmp_path / "three.robot.yaml")
     assert list(load_robot(three.file).groups) == ["a_arm", "b_arm", "c_arm"]
+
+
+def test_two_kinds_of_arms_keep_both_groups_and_hands(tmp_path: Path) -> None:
+    first = write_toy(tmp_path)
+    other = re.sub(r'"(stand|part|finger|joint|grip)', r'"my_\1', toy_urdf()).replace(
+        'robot name="toy"', 'robot name="my"'
+    )
+    (tmp_path / "my.urdf").write_text(other)
+    places = [(0, -0.5, 0, 0), (0, 0.5, 0, 0)]
+    made = new_robot(sources_of([str(first), str(tmp_path / "my.urdf")], [], places), tmp_path / "two.robot.yaml")
+    robot = load_robot(made.file)
+    assert {name: len(group) for name, group in robot.groups.items()} == {"right_arm": 4, "left_arm": 4}
+    assert {name: hand.palm for name, hand in robot.hands.items()} == {
+        "right_hand": "right_part4", "left_hand": "left_my_part4"
+    }  # fmt: skip
 
 
 def test_places_and_srdfs_fit_the_urdfs(tmp_path: Path) -> None:
