@@ -149,21 +149,9 @@ def _read(source: Source, packages: Mapping[str, Path]) -> _Part:
     file = urdf_file(source.urdf, packages)
     text = expanded(file) if is_xacro(file) else None
     given = source.urdf if source.urdf.startswith("package://") and text is None else str(file)
-    if text is None:
-        robot = read_description(file)
-    else:
-        robot = _read_text(text, file)
+    robot = read_description(file, text)
     srdf = urdf_file(source.srdf, packages) if source.srdf else None
     return _Part(source, file, given, text, robot, read_semantics(srdf, robot) if srdf else None)
-
-
-def _read_text(text: str, file: Path) -> Description:
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / file.with_suffix("").name
-        path.write_text(text)
-        return read_description(path)
 
 
 def _name_parts(parts: list[_Part]) -> None:

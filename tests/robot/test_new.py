@@ -10,7 +10,7 @@ from toy_robot import LIMIT, SRDF, toy_urdf, write_toy
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, RobotError
-from apex_ompl.robot import load_robot
+from apex_ompl.robot import load_robot, new
 from apex_ompl.robot.description import read_description, read_semantics
 from apex_ompl.robot.guesses import arms_of
 from apex_ompl.robot.new import new_robot, sources_of
@@ -197,6 +197,14 @@ def test_what_xacro_makes_is_written_beside_the_robot_file(tmp_path: Path, monke
     (tmp_path / "toy.urdf.xacro").write_text("<robot/>")
     made = new_robot(sources_of([str(tmp_path / "toy.urdf.xacro")]), tmp_path / "toy.robot.yaml")
     assert (tmp_path / "toy.urdf") in made.files and load_robot(made.file).dof == 4
+
+
+def test_a_fault_in_what_xacro_makes_names_the_xacro_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "toy.urdf.xacro"
+    file.write_text("<robot/>")
+    monkeypatch.setattr(new, "expanded", lambda file: toy_urdf({'name="joint2"': 'name="joint1"'}))
+    with pytest.raises(RobotError, match=f"^{file}: expected joints of different names, 'joint1' is given twice"):
+        new_robot(sources_of([str(file)]), tmp_path / "toy.robot.yaml")
 
 
 def test_limbs_are_found_without_fingers_and_legs(tmp_path: Path) -> None:
