@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -19,7 +19,9 @@ import numpy as np
 from apex_ompl.errors import RobotError
 from apex_ompl.robot.compose import LIMITED, check_urdf, numbers, origin_of, parse_xml
 from apex_ompl.types import Array
+from apex_ompl.util.extras import import_extra
 
+XACRO = ".xacro"
 TURNING = ("revolute", "continuous")
 ONE_DOF = (*LIMITED, "continuous")
 
@@ -109,6 +111,20 @@ class Description:
     def followers(self, name: str) -> list[str]:
         """Return the joints that mimic a joint."""
         return [joint.name for joint in self.joints.values() if joint.mimics == name]
+
+
+def expanded(file: Path) -> str:
+    """Return the URDF that a xacro file describes, by its default arguments.
+
+    Raises:
+        MissingFileError: The package xacro is not installed.
+        RobotError: xacro finds a fault.
+    """
+    xacro: Any = import_extra("xacro", "xacro files", "xacro")
+    try:
+        return str(xacro.process_file(str(file)).toprettyxml(indent=" "))
+    except (Exception, SystemExit) as error:  # xacro raises many kinds
+        raise RobotError(f"{file}: xacro cannot expand it ({' '.join(str(error).split())})") from error
 
 
 def read_description(file: Path, text: str | None = None) -> Description:

@@ -15,12 +15,11 @@ import numpy as np
 
 from apex_ompl.errors import ParameterError, RobotError
 from apex_ompl.robot import guesses
-from apex_ompl.robot.config import PAIRS_SCHEMA, SCHEMA, RobotConfig
-from apex_ompl.robot.description import Description, Semantics, read_description, read_semantics
+from apex_ompl.robot.config import PAIRS_SCHEMA, SCHEMA, RobotConfig, resolve
+from apex_ompl.robot.description import XACRO, Description, Semantics, expanded, read_description, read_semantics
 from apex_ompl.robot.home import Home, find_home
 from apex_ompl.robot.model import build_robot
 from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, shares_by_links
-from apex_ompl.robot.sources import expanded, is_xacro, urdf_file
 from apex_ompl.util.display import counted
 from apex_ompl.util.files import check_writable, suffix_of, write_atomically
 from apex_ompl.util.schema import validate, yaml_value
@@ -29,6 +28,7 @@ from apex_ompl.util.validation import number_array
 SUFFIX = ".robot.yaml"
 SAMPLES = 1000  # random states of the search for pairs that always touch, and for a home
 OFTEN = 0.02  # share of states from which a pair that touches is named
+PLACE = "x,y,z,yaw, finite numbers [m, rad]"  # as --at expects it
 NUMBERS = ("dual", "three", "four", "five", "six")
 
 
@@ -98,7 +98,7 @@ def sources_of(urdfs: Sequence[str], srdfs: Sequence[str] = (), places: Sequence
     for k, urdf in enumerate(urdfs):
         place = number_array(list(places[k]), "--at", "x,y,z,yaw") if places else np.zeros(4)
         if place.shape not in ((3,), (4,)) or not np.isfinite(place).all():
-            raise ParameterError("--at", list(places[k]), "x,y,z,yaw, finite numbers [m, rad]")
+            raise ParameterError("--at", list(places[k]), PLACE)
         x, y, z, yaw = (*map(float, place), 0.0)[:4]
         srdf = None if not srdfs else srdfs[0] if len(srdfs) == 1 else srdfs[k]
         found.append(Source(urdf, srdf, (x, y, z, yaw)))
@@ -146,11 +146,11 @@ def _stem(output: Path) -> str:
 
 
 def _read(source: Source, packages: Mapping[str, Path]) -> _Part:
-    file = urdf_file(source.urdf, packages)
-    text = expanded(file) if is_xacro(file) else None
+    file = resolve(source.urdf, Path.cwd(), "URDF", packages).resolve()
+    text = expanded(file) if file.suffix.lower() == XACRO else None
     given = source.urdf if source.urdf.startswith("package://") and text is None else str(file)
     robot = read_description(file, text)
-    srdf = urdf_file(source.srdf, packages) if source.srdf else None
+    srdf = resolve(source.srdf, Path.cwd(), "SRDF", packages).resolve() if source.srdf else None
     return _Part(source, file, given, text, robot, read_semantics(srdf, robot) if srdf else None)
 
 
