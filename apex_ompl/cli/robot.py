@@ -8,6 +8,7 @@ import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import NoReturn
 
 from apex_ompl.cli.options import name_value_pairs
@@ -17,8 +18,7 @@ from apex_ompl.collision.cover.preparation import prepare as prepare_robot
 from apex_ompl.collision.cover.survey import Survey, survey
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.robot.new import new_robot, sources_of
-from apex_ompl.robot.sources import package_map
+from apex_ompl.robot.new import PLACE, new_robot, sources_of
 from apex_ompl.util.display import Summary, counted
 from apex_ompl.util.validation import check_integer
 
@@ -29,8 +29,7 @@ ENOUGH = 0.85  # share of free states that covers should prove
 def new(parsed: argparse.Namespace) -> int:
     """Write a robot file, and print what was guessed."""
     places = [_place(text) for text in parsed.at]
-    packages = package_map(name_value_pairs("--package", parsed.package))
-    made = new_robot(sources_of(parsed.urdf, parsed.srdf, places), parsed.out, packages)
+    made = new_robot(sources_of(parsed.urdf, parsed.srdf, places), parsed.out, _packages(parsed.package))
     for note in made.notes:
         print(f"apex-ompl: note: {note}", file=sys.stderr)
     print(*made.files, sep="\n")
@@ -39,12 +38,20 @@ def new(parsed: argparse.Namespace) -> int:
 
 def _place(text: str) -> list[float]:
     try:
-        place = [float(word) for word in text.split(",")]
-    except ValueError:
-        place = []
-    if len(place) not in (3, 4) or not all(map(math.isfinite, place)):
-        raise ParameterError("--at", text, "x,y,z,yaw, finite numbers [m, rad]")
-    return place
+        return [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise ParameterError("--at", text, PLACE) from error
+
+
+def _packages(pairs: Sequence[str]) -> dict[str, Path]:
+    """Return package name -> absolute folder."""
+    found = {}
+    for name, folder in name_value_pairs("--package", pairs).items():
+        path = Path(folder).expanduser().resolve()
+        if not path.is_dir():
+            raise ParameterError("--package", f"{name}={folder}", "NAME=FOLDER with a folder that exists")
+        found[name] = path
+    return found
 
 
 def check(parsed: argparse.Namespace) -> int:

@@ -27,9 +27,10 @@ from apex_ompl.collision.clearance_tables import (
     table_range,
     write_clearances,
 )
+from apex_ompl.collision.cover.quick import covers_of
 from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.tables import joint_tree, make_tables
+from apex_ompl.collision.tables import joint_tree, tabulate
 from apex_ompl.kernel.arrays import pack
 from apex_ompl.kernel.box_bound import BoxBounds
 from apex_ompl.kernel.clearance_table import LARGEST, UNIT
@@ -84,7 +85,7 @@ class TableMaker:
     """Makes the tables of a robot's pairs of links, those first that the covers leave open most often."""
 
     def __init__(self, robot: Robot) -> None:
-        """Make tables for ``robot``.
+        """Find the pairs of ``robot`` that its covers alone leave open; tables that it has are not used.
 
         Raises:
             MissingFileError: The robot names a file of covers that cannot be read.
@@ -93,7 +94,10 @@ class TableMaker:
         """
         stage, tree = MeshStage(robot), joint_tree(robot)
         self._robot, self._solids = robot, [stage.solids[k] for k in range(stage.links)]
-        tables = make_tables(robot, self._solids, [False] * stage.links, stage.body_pairs)
+        tables = tabulate(
+            robot, solids=self._solids, numbers=range(stage.links), pairs=stage.body_pairs,
+            covers=covers_of(robot, [solid.shape for solid in self._solids]), meets_scene=[False] * stage.links,
+        )  # fmt: skip
         self._kernel = Kernel(tables, scene_tables([]))
         self._row = {number: row for row, number in enumerate(tables.numbers)}
         bodies = [self._solids[number] for number in tables.numbers]
@@ -155,6 +159,30 @@ class TableMaker:
                 break
         return cells, True
 
+    def make_all(
+        self, seconds: float, progress: Callable[[TableReport], None] | None = None, known: Mapping[str, Cells] = {}
+    ) -> dict[str, Cells]:
+        """Return the cells of all tables, by the digests of their pairs.
+
+        Args:
+            seconds: CPU time [s].
+            progress: Called with what was found for each table that is made.
+            known: Tables that were made before; those of other pairs are left out.
+        """
+        found = {pair.key: known[pair.key] for pair in self.pairs if pair.key in known}
+        start = time.process_time()
+        for pair, share in zip(self.pairs, self.shares, strict=True):
+            began = time.process_time()
+            if pair.key in found or began - start > seconds:
+                continue
+            cells, complete = self.make(pair, SHARE * (seconds - (began - start)))
+            if cells.any():
+                found[pair.key] = cells
+            if progress is not None:
+                table, took = table_of(self._robot, pair, cells), time.process_time() - began
+                progress(TableReport(self.names(pair), table.joints, share, table.proved, len(cells), took, complete))
+        return found
+
 
 def _doubled(array: NDArray[Any]) -> NDArray[Any]:
     """Return an array with each element twice along each axis."""
@@ -164,8 +192,7 @@ def _doubled(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def make_clearances(
-    robot: Robot, seconds: float = 60.0, progress: Callable[[TableReport], None] | None = None,
-    known: Mapping[str, Cells] | None = None,
+    robot: Robot, seconds: float = 60.0, progress: Callable[[TableReport], None] | None = None
 ) -> dict[str, Cells]:  # fmt: skip
     """Return the cells of the tables of a robot, by the digests of their pairs.
 
@@ -173,25 +200,13 @@ def make_clearances(
         robot: The robot; tables that it has are not used.
         seconds: CPU time for all of them [s]; see above.
         progress: Called with what was found for each table.
-        known: Tables that were made before, which are kept.
 
     Raises:
         MissingFileError: The robot names a file of covers that cannot be read.
         FileFormatError: That file does not follow its schema.
         RobotError: The kernel does not support the motion of a joint.
     """
-    found, start, maker = dict(known or {}), time.process_time(), TableMaker(robot)
-    for pair, share in zip(maker.pairs, maker.shares, strict=True):
-        began = time.process_time()
-        if pair.key in found or began - start > seconds:
-            continue
-        cells, complete = maker.make(pair, SHARE * (seconds - (began - start)))
-        if cells.any():
-            found[pair.key] = cells
-        if progress is not None:
-            table, took = table_of(robot, pair, cells), time.process_time() - began
-            progress(TableReport(maker.names(pair), table.joints, share, table.proved, len(cells), took, complete))
-    return found
+    return TableMaker(robot).make_all(seconds, progress)
 
 
 def prepare_clearances(
@@ -213,9 +228,7 @@ def prepare_clearances(
     """
     path = clearance_file(robot)
     check_writable(path)
-    keys = {pair.key for pair in TableMaker(robot).pairs}
-    known = {key: cells for key, cells in (read_clearances(path) if is_file(path) else {}).items() if key in keys}
-    made = make_clearances(robot, seconds, progress, known)
+    made = TableMaker(robot).make_all(seconds, progress, read_clearances(path) if is_file(path) else {})
     if not made and not is_file(path):
         return None
     write_clearances(path, made)

@@ -138,7 +138,7 @@ def _cells_in_file(robot: Robot) -> dict[str, Cells]:
     return read_clearances(path) if is_file(path) else {}
 
 
-def clearance_keys(robot: Robot) -> dict[str, str]:
+def clearance_digests(robot: Robot) -> dict[str, str]:
     """Return a digest of each table in a robot's file, by the digests of their pairs; none without a file.
 
     Raises:
@@ -169,15 +169,11 @@ def clearances_of(
         return {}
     if robot not in _tables:
         near = near_pairs(robot, tree, solids, ((pair.first, pair.second) for pair in robot.geometry.collisionPairs))
-        _tables[robot] = {pair.links: table_of(robot, pair, cells[pair.key]) for pair in near if pair.key in cells}
+        near = [pair for pair in near if pair.key in cells]
+        for pair in near:
+            if cells[pair.key].ndim != len(pair.sources):
+                expected = f"expected {len(pair.sources)} axes, one for each joint"
+                raise FileFormatError(str(clearance_file(robot)), pair.key, cells[pair.key].shape, expected)
+        _tables[robot] = {pair.links: table_of(robot, pair, cells[pair.key]) for pair in near}
     known = _tables[robot]
     return {pair: known[pair] for pair in pairs if pair in known}
-
-
-def keep_clearances(robot: Robot, cells: Mapping[str, Cells]) -> None:
-    """Use these tables for a robot instead of those in its file; checkers that were made before stay as they are.
-
-    New ones use them from :func:`apex_ompl.collision.conservative.forget_tables` on.
-    """
-    _cells_in_file.keep(robot, dict(cells))
-    _tables.pop(robot, None)

@@ -43,11 +43,6 @@ _robots: WeakKeyDictionary[Robot, dict[Hashable, tuple[RobotTables, list[int]]]]
 """Tables of a robot with its held objects, and the numbers that links and held objects had then."""
 
 
-def forget_tables(robot: Robot) -> None:
-    """Forget the tables of a robot, so that new checkers read its covers and clearances again."""
-    _robots.pop(robot, None)
-
-
 @dataclass
 class CheckCounts:
     """Numbers of checks by the two stages of a checker.

@@ -19,7 +19,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.collision.clearance_tables import clearance_keys, clearances_of
+from apex_ompl.collision.clearance_tables import clearance_digests, clearances_of
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.quick import bounding_boxes, covers_of
@@ -220,7 +220,7 @@ def stored_tables(
     parts = [
         robot.urdf.encode(), robot.to_pinocchio(np.arange(float(robot.dof))).tobytes(), limits.lower.tobytes(),
         limits.upper.tobytes(), b"" if robot.covers is None else read_file(robot.covers, "sphere covers"),
-        json.dumps(sorted(clearance_keys(robot))).encode(),
+        json.dumps(clearance_digests(robot), sort_keys=True).encode(),
         *(_of_shape(s.shape, s.joint, s.placement.homogeneous, s.part or s.name) for s in solids),
         repr((robot.name, robot.joint_names, list(meets_scene), list(pairs))).encode(),
     ]  # fmt: skip

@@ -204,15 +204,19 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
     return Composition(ET.tostring(root, encoding="unicode"), disabled, part_links, tuple(dict.fromkeys(files)))
 
 
-def parse_xml(path: Path) -> ET.Element:
+def parse_xml(path: Path, text: str | None = None) -> ET.Element:
     """Return the root of a URDF or an SRDF, whose element is ``robot``.
+
+    Args:
+        path: The file.
+        text: Its content, where it is not that of the file: what xacro made of it.
 
     Raises:
         MissingFileError: The file cannot be read.
         RobotError: It is not XML, or its root is another element.
     """
     try:
-        root = ET.fromstring(read_file(path, "robot description"))
+        root = ET.fromstring(read_file(path, "robot description") if text is None else text)
     except (ET.ParseError, ValueError, LookupError) as error:
         raise RobotError(f"{path}: not valid XML ({error})") from error
     if root.tag != "robot":

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -19,7 +19,9 @@ import numpy as np
 from apex_ompl.errors import RobotError
 from apex_ompl.robot.compose import LIMITED, check_urdf, numbers, origin_of, parse_xml
 from apex_ompl.types import Array
+from apex_ompl.util.extras import import_extra
 
+XACRO = ".xacro"
 TURNING = ("revolute", "continuous")
 ONE_DOF = (*LIMITED, "continuous")
 
@@ -60,14 +62,12 @@ class Description:
     """The tree of a URDF.
 
     Attributes:
-        file: The file.
         name: The robot's name, which may be empty.
         links: Names of its links.
         solid: Names of the links that have collision geometry.
         joints: Joints by name, in the order of the file.
     """
 
-    file: Path
     name: str
     links: tuple[str, ...]
     solid: frozenset[str]
@@ -113,14 +113,32 @@ class Description:
         return [joint.name for joint in self.joints.values() if joint.mimics == name]
 
 
-def read_description(file: Path) -> Description:
+def expanded(file: Path) -> str:
+    """Return the URDF that a xacro file describes, by its default arguments.
+
+    Raises:
+        MissingFileError: The package xacro is not installed.
+        RobotError: xacro finds a fault.
+    """
+    xacro: Any = import_extra("xacro", "xacro files", "xacro")
+    try:
+        return str(xacro.process_file(str(file)).toprettyxml(indent=" "))
+    except (Exception, SystemExit) as error:  # xacro raises many kinds
+        raise RobotError(f"{file}: xacro cannot expand it ({' '.join(str(error).split())})") from error
+
+
+def read_description(file: Path, text: str | None = None) -> Description:
     """Read the tree of a URDF.
+
+    Args:
+        file: The file.
+        text: The URDF that xacro made of it, where it did.
 
     Raises:
         MissingFileError: The file cannot be read.
         RobotError: It is not a URDF of one tree with joints; the message names the element.
     """
-    root = parse_xml(file)
+    root = parse_xml(file, text)
     links = [_name(link, "link", file) for link in root.findall("link")]
     names = [_name(joint, "joint", file) for joint in root.findall("joint")]
     for what, all_of in (("links", links), ("joints", names)):
@@ -133,7 +151,7 @@ def read_description(file: Path) -> Description:
     joints = {name: _joint(joint, name, file) for name, joint in zip(names, root.findall("joint"), strict=True)}
     _check_tree(joints, links, file)
     solid = frozenset(str(link.get("name")) for link in root.findall("link") if link.find("collision") is not None)
-    return Description(file, root.get("name", ""), tuple(links), solid, joints)
+    return Description(root.get("name", ""), tuple(links), solid, joints)
 
 
 def _name(element: ET.Element, what: str, file: Path) -> str:

@@ -74,7 +74,7 @@ def _first(robot: Robot, checks: SelfCollision, states: Array, note: str) -> Hom
     if not rounded:
         raise _none(robot, checks)
     apart = SelfCollision(robot, [pair for pair in checks.pairs if not are_neighbors(robot, pair)])
-    room = [apart.distance(q) for q in rounded]
+    room = [float(apart.distances(q).min(initial=np.inf)) for q in rounded]
     best = next((k for k, distance in enumerate(room) if distance >= ROOM), int(np.argmax(room)))
     return Home(
         _rounded(rounded[best]), f"{note}; links are {room[best] * 1e3:.0f} mm apart" * (room[best] < 1e3) or note

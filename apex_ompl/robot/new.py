@@ -15,12 +15,11 @@ import numpy as np
 
 from apex_ompl.errors import ParameterError, RobotError
 from apex_ompl.robot import guesses
-from apex_ompl.robot.config import PAIRS_SCHEMA, SCHEMA, RobotConfig
-from apex_ompl.robot.description import Description, Semantics, read_description, read_semantics
+from apex_ompl.robot.config import PAIRS_SCHEMA, SCHEMA, RobotConfig, resolve
+from apex_ompl.robot.description import XACRO, Description, Semantics, expanded, read_description, read_semantics
 from apex_ompl.robot.home import Home, find_home
 from apex_ompl.robot.model import build_robot
 from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, shares_by_links
-from apex_ompl.robot.sources import expanded, is_xacro, urdf_file
 from apex_ompl.util.display import counted
 from apex_ompl.util.files import check_writable, suffix_of, write_atomically
 from apex_ompl.util.schema import validate, yaml_value
@@ -29,6 +28,7 @@ from apex_ompl.util.validation import number_array
 SUFFIX = ".robot.yaml"
 SAMPLES = 1000  # random states of the search for pairs that always touch, and for a home
 OFTEN = 0.02  # share of states from which a pair that touches is named
+PLACE = "x,y,z,yaw, finite numbers [m, rad]"  # as --at expects it
 NUMBERS = ("dual", "three", "four", "five", "six")
 
 
@@ -98,7 +98,7 @@ def sources_of(urdfs: Sequence[str], srdfs: Sequence[str] = (), places: Sequence
     for k, urdf in enumerate(urdfs):
         place = number_array(list(places[k]), "--at", "x,y,z,yaw") if places else np.zeros(4)
         if place.shape not in ((3,), (4,)) or not np.isfinite(place).all():
-            raise ParameterError("--at", list(places[k]), "x,y,z,yaw, finite numbers [m, rad]")
+            raise ParameterError("--at", list(places[k]), PLACE)
         x, y, z, yaw = (*map(float, place), 0.0)[:4]
         srdf = None if not srdfs else srdfs[0] if len(srdfs) == 1 else srdfs[k]
         found.append(Source(urdf, srdf, (x, y, z, yaw)))
@@ -146,32 +146,23 @@ def _stem(output: Path) -> str:
 
 
 def _read(source: Source, packages: Mapping[str, Path]) -> _Part:
-    file = urdf_file(source.urdf, packages)
-    text = expanded(file) if is_xacro(file) else None
+    file = resolve(source.urdf, Path.cwd(), "URDF", packages).resolve()
+    text = expanded(file) if file.suffix.lower() == XACRO else None
     given = source.urdf if source.urdf.startswith("package://") and text is None else str(file)
-    if text is None:
-        robot = read_description(file)
-    else:
-        robot = _read_text(text, file)
-    srdf = urdf_file(source.srdf, packages) if source.srdf else None
+    robot = read_description(file, text)
+    srdf = resolve(source.srdf, Path.cwd(), "SRDF", packages).resolve() if source.srdf else None
     return _Part(source, file, given, text, robot, read_semantics(srdf, robot) if srdf else None)
 
 
-def _read_text(text: str, file: Path) -> Description:
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / file.with_suffix("").name
-        path.write_text(text)
-        return read_description(path)
-
-
 def _name_parts(parts: list[_Part]) -> None:
-    """Give parts their names, and prefixes where names of links or joints collide."""
+    """Give parts their names, and prefixes where names of links, joints, groups or hands collide."""
     letters = ascii_lowercase + ascii_uppercase
     if len(parts) > len(letters):
         raise ParameterError("URDF", f"{len(parts)} of them", f"at most {len(letters)}")
-    names = [{*part.robot.links, *part.robot.joints} for part in parts]
+    names = [
+        {*part.robot.links, *part.robot.joints, *(name for arm in part.arms for name in (arm.group, arm.hand))}
+        for part in parts
+    ]
     common = any(names[i] & names[j] for i in range(len(names)) for j in range(i))
     for k, part in enumerate(parts):
         part.name = _part_name(part)
@@ -279,8 +270,7 @@ class _Writer:
         self.data["locked"] |= {prefix + joint: value for joint, value in locked.items()}
 
     def _add_arm(self, part: _Part, arm: guesses.Arm) -> None:
-        group = f"{part.prefix}{arm.group}"
-        hand = f"{part.prefix}{arm.hand}" if arm.hand != "hand" or not part.prefix else f"{part.prefix}hand"
+        group, hand = part.prefix + arm.group, part.prefix + arm.hand
         self.data["groups"][group] = [part.prefix + joint for joint in arm.joints]
         self.comments[f"groups.{group}"] = arm.note
         self.notes.append(f"{group}: {arm.note}")

@@ -5,8 +5,9 @@ Planning uses :class:`apex_ompl.collision.CollisionChecker`, which is far faster
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -19,14 +20,18 @@ ALWAYS = (
 
 
 class SelfCollision:
-    """Which pairs of geometries of a robot collide at a state."""
+    """Which pairs of geometries of a robot collide at a state, and how far apart they are."""
 
-    def __init__(self, robot: Robot, pairs: Sequence[tuple[int, int]] | None = None) -> None:
+    def __init__(
+        self, robot: Robot, pairs: Sequence[tuple[int, int]] | None = None,
+        shapes: Mapping[int, coal.CollisionGeometry] | None = None,
+    ) -> None:  # fmt: skip
         """Prepare the checks.
 
         Args:
             robot: The robot.
             pairs: Pairs of indices of geometries; by default all that the robot checks.
+            shapes: Index -> shape in place of that of the geometry, such as its convex hull.
         """
         self.robot = robot
         self.pairs = enabled_pairs(robot) if pairs is None else list(pairs)
@@ -34,6 +39,8 @@ class SelfCollision:
         self._geometry.removeAllCollisionPairs()
         for pair in self.pairs:
             self._geometry.addCollisionPair(pin.CollisionPair(*pair))
+        for k, shape in (shapes or {}).items():
+            self._geometry.geometryObjects[k].geometry = shape
         self._results = self._geometry.createData()
 
     def colliding(self, q: Array) -> Flags:
@@ -47,11 +54,11 @@ class SelfCollision:
         found = [self.colliding(q) for q in states]
         return np.array(found, bool).reshape(len(found), len(self.pairs))
 
-    def distance(self, q: Array) -> float:
-        """Return the least distance of the pairs at a state [m]; negative where they overlap."""
+    def distances(self, q: Array) -> Array:
+        """Return the distances of the pairs at a state, shape (pairs,) [m]; negative where they overlap."""
         q = self.robot.to_pinocchio(q)
         pin.computeDistances(self.robot.model, self._data, self._geometry, self._results, q)
-        return min((result.min_distance for result in self._results.distanceResults), default=np.inf)
+        return np.array([result.min_distance for result in self._results.distanceResults], float)
 
 
 def enabled_pairs(robot: Robot) -> list[tuple[int, int]]:

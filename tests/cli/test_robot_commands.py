@@ -47,7 +47,7 @@ def test_faults_are_one_sentence_and_exit_code_2(apex_cli, tmp_path: Path, monke
         (("new", "gone.urdf"), "no such file"),
         (("new", "."), "URDF"),
         (("new", "empty.urdf"), "not valid XML"),
-        (("new", "toy.urdf", "--srdf", "gone.srdf"), "gone.srdf"),
+        (("new", "toy.urdf", "--srdf", "gone.srdf"), "SRDF '"),
         (("new", "toy.urdf", "--at", "1,2"), "--at: expected x,y,z,yaw"),
         (("new", "toy.urdf", "toy.urdf"), "--at: expected one for each of 2 URDFs"),
         (("new", "toy.urdf", "--package", "a"), "--package: expected NAME=VALUE"),

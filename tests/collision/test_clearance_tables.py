@@ -11,7 +11,7 @@ import pytest
 from near_links import write_arm
 
 from apex_ompl import load_robot
-from apex_ompl.collision import CollisionChecker, clearance_tables, conservative
+from apex_ompl.collision import CollisionChecker, clearance_tables
 from apex_ompl.collision.clearance_making import TableMaker, TableReport, make_clearances, prepare_clearances
 from apex_ompl.collision.clearance_tables import clearance_file, near_pairs, read_clearances, table_of, write_clearances
 from apex_ompl.collision.solids import transform
@@ -198,13 +198,18 @@ def test_a_budget_of_no_time_makes_no_tables_and_reports_tell_what_was_found(bar
     reports: list[TableReport] = []
     assert make_clearances(bare, 0.0, reports.append) == {}
     assert all(not report.complete for report in reports)
-    found = make_clearances(bare, 60.0, reports.append)
+    make_clearances(bare, 60.0, reports.append)
     last = reports[-1]
     assert last.complete
     assert 0.0 < last.proved <= 1.0
     assert " of the range proved" in str(last)
-    again: list[TableReport] = []
-    assert make_clearances(bare, 60.0, again.append, known=found) == found
+
+
+def test_a_second_preparation_keeps_the_tables_of_the_first(folder: Path) -> None:
+    file, again = clearance_file(robot_of(folder, "tabled")), list[TableReport]()
+    first = file.read_bytes()
+    assert prepare_clearances(robot_of(folder, "tabled"), progress=again.append) == file
+    assert file.read_bytes() == first
     assert not again
 
 
@@ -223,6 +228,17 @@ def test_a_file_gets_what_it_lacks_and_loses_what_is_of_another_robot(tmp_path: 
     assert all((found[key] == whole[key]).all() for key in whole)
 
 
+def test_a_file_with_other_cells_replaces_tables_that_are_kept(folder: Path, tmp_path: Path) -> None:
+    file, proved = write_arm(tmp_path), []
+    cells = read_clearances(clearance_file(robot_of(folder, "tabled")))
+    for some in (cells, {key: 0 * one for key, one in cells.items()}):
+        write_clearances(clearance_file(load_robot(str(file))), some)
+        robot = load_robot(str(file))
+        states = robot.random_state(np.random.default_rng(6), 200)
+        proved.append((CollisionChecker(robot).kernel.unproved(states)[1] == 0).mean())
+    assert proved[0] > proved[1]
+
+
 @pytest.mark.parametrize("cells", [np.zeros(3, np.uint8), np.zeros(4), np.zeros((4, 2), np.uint8), np.uint8(1)])
 def test_files_with_other_content_are_refused(tmp_path: Path, cells: np.ndarray) -> None:
     path = tmp_path / "a.clearances.npz"
@@ -231,7 +247,14 @@ def test_files_with_other_content_are_refused(tmp_path: Path, cells: np.ndarray)
         read_clearances(path)
 
 
+def test_a_table_with_another_number_of_axes_than_joints_is_refused(folder: Path, tmp_path: Path) -> None:
+    robot = load_robot(str(write_arm(tmp_path)))
+    cells = read_clearances(clearance_file(robot_of(folder, "tabled")))
+    write_clearances(clearance_file(robot), {key: np.zeros(8, np.uint8) for key in cells})
+    with pytest.raises(FileFormatError, match=r"expected \d axes, one for each joint"):
+        assert CollisionChecker(robot).kernel
+
+
 def test_the_robot_of_the_tables_is_planned_for_with_them(tabled: Robot) -> None:
-    conservative.forget_tables(tabled)
     arrays = CollisionChecker(tabled).kernel.robot.arrays
     assert (arrays.bodies_table >= 0).sum() == len(arrays.table_cells) >= 3

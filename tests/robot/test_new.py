@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from toy_robot import LIMIT, SRDF, toy_urdf, write_toy
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, RobotError
-from apex_ompl.robot import load_robot
+from apex_ompl.robot import load_robot, new
 from apex_ompl.robot.description import read_description, read_semantics
 from apex_ompl.robot.guesses import arms_of
 from apex_ompl.robot.new import new_robot, sources_of
@@ -116,6 +117,21 @@ def test_two_urdfs_stand_in_one_cell_with_names_of_their_sides(tmp_path: Path) -
     assert list(load_robot(three.file).groups) == ["a_arm", "b_arm", "c_arm"]
 
 
+def test_two_kinds_of_arms_keep_both_groups_and_hands(tmp_path: Path) -> None:
+    first = write_toy(tmp_path)
+    other = re.sub(r'"(stand|part|finger|joint|grip)', r'"my_\1', toy_urdf()).replace(
+        'robot name="toy"', 'robot name="my"'
+    )
+    (tmp_path / "my.urdf").write_text(other)
+    places = [(0, -0.5, 0, 0), (0, 0.5, 0, 0)]
+    made = new_robot(sources_of([str(first), str(tmp_path / "my.urdf")], [], places), tmp_path / "two.robot.yaml")
+    robot = load_robot(made.file)
+    assert {name: len(group) for name, group in robot.groups.items()} == {"right_arm": 4, "left_arm": 4}
+    assert {name: hand.palm for name, hand in robot.hands.items()} == {
+        "right_hand": "right_part4", "left_hand": "left_my_part4"
+    }  # fmt: skip
+
+
 def test_places_and_srdfs_fit_the_urdfs(tmp_path: Path) -> None:
     for srdfs, places in (([], [(0, 0, 0, 0)]), (["a", "b", "c"], [(0, 0, 0, 0)] * 2), ([], [])):
         with pytest.raises(ParameterError, match="one for each of 2 URDFs"):
@@ -181,6 +197,14 @@ def test_what_xacro_makes_is_written_beside_the_robot_file(tmp_path: Path, monke
     (tmp_path / "toy.urdf.xacro").write_text("<robot/>")
     made = new_robot(sources_of([str(tmp_path / "toy.urdf.xacro")]), tmp_path / "toy.robot.yaml")
     assert (tmp_path / "toy.urdf") in made.files and load_robot(made.file).dof == 4
+
+
+def test_a_fault_in_what_xacro_makes_names_the_xacro_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "toy.urdf.xacro"
+    file.write_text("<robot/>")
+    monkeypatch.setattr(new, "expanded", lambda file: toy_urdf({'name="joint2"': 'name="joint1"'}))
+    with pytest.raises(RobotError, match=f"^{file}: expected joints of different names, 'joint1' is given twice"):
+        new_robot(sources_of([str(file)]), tmp_path / "toy.robot.yaml")
 
 
 def test_limbs_are_found_without_fingers_and_legs(tmp_path: Path) -> None:

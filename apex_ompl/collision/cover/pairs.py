@@ -164,18 +164,19 @@ def _decide(
     if not left or time.monotonic() > deadline:
         return reasons
     states = robot.random_state(rng, DISTANCES)
-    hulls = _Pairs(robot, left, hulls=True)
-    table = np.array([hulls.distances(q) for q in states])
+    hulls = {k: convex_hull(robot.geometry.geometryObjects[k].geometry) for k in {k for pair in left for k in pair}}
+    apart = SelfCollision(robot, left, hulls)
+    table = np.array([apart.distances(q) for q in states])
     for k, pair in enumerate(left):
         if time.monotonic() > deadline:
             break
         progress(0.5 + 0.5 * k / len(left))
         closest = float(table[:, k].min())
-        alone = _Pairs(robot, [pair], hulls=True)
+        alone = SelfCollision(robot, [pair], {k: hulls[k] for k in pair})
         for q in states[np.argsort(table[:, k])[:STARTS]]:
             if closest < search.margin:
                 break
-            closest = min(closest, alone.closest(q))
+            closest = min(closest, _closest(alone, q))
         if closest >= search.margin:
             reasons[pair] = f"never in {search.samples} samples, closest found {closest * 1e3:.0f} mm"
     return reasons
@@ -199,7 +200,7 @@ def apart_over(robot: Robot, pair: Pair) -> str:
     k = robot.joint_names.index(model.names[moved])
     item = robot.geometry.geometryObjects[pair[joints.index(moved)]]
     reach = 1.0 if "P" in model.joints[moved].shortname() else _reach(item)
-    alone = _Pairs(robot, [pair])
+    alone = SelfCollision(robot, [pair])
     intervals = [(float(robot.limits.lower[k]), float(robot.limits.upper[k]))]
     for low, high in intervals:
         q = robot.home.copy()
@@ -220,52 +221,32 @@ def _reach(item: pin.GeometryObject) -> float:
     return float(np.linalg.norm(middle) + item.geometry.aabb_radius)
 
 
-class _Pairs:
-    """Distances between chosen pairs, by their shapes or by the convex hulls of these."""
+def _closest(alone: SelfCollision, q: Array) -> float:
+    """Return the least distance of a single pair that a descent from a state finds [m].
 
-    def __init__(self, robot: Robot, pairs: list[Pair], *, hulls: bool = False) -> None:
-        self.robot, self.data = robot, robot.model.createData()
-        self.geometry = robot.geometry.copy()
-        self.geometry.removeAllCollisionPairs()
-        used = {k for pair in pairs for k in pair}
-        for pair in pairs:
-            self.geometry.addCollisionPair(pin.CollisionPair(*pair))
-        for k in used if hulls else ():
-            self.geometry.geometryObjects[k].geometry = convex_hull(robot.geometry.geometryObjects[k].geometry)
-        self.results = self.geometry.createData()
-
-    def distances(self, q: Array) -> Array:
-        """Return the signed distances at a state, shape (pairs,) [m]."""
-        q = self.robot.to_pinocchio(q)
-        pin.computeDistances(self.robot.model, self.data, self.geometry, self.results, q)
-        return np.array([result.min_distance for result in self.results.distanceResults], float)
-
-    def closest(self, q: Array) -> float:
-        """Return the least distance of a single pair that a descent from a state finds [m].
-
-        The direction is that of the signed gradient by finite differences, scaled by the ranges of the joints; the step
-        is halved where it does not help.
-        """
-        low, high = self.robot.limits.lower, self.robot.limits.upper
-        span = np.minimum(high - low, 2.0 * np.pi)
-        best, step = float(self.distances(q)[0]), 0.1
-        for _ in range(STEPS):
-            slope = np.zeros(len(q))
-            for k in range(len(q)):
-                moved = q.copy()
-                change = 1e-4 * span[k] * (1.0 if q[k] + 1e-4 * span[k] <= high[k] else -1.0)
-                moved[k] += change
-                slope[k] = (self.distances(moved)[0] - best) / change * span[k]
-            size = float(np.linalg.norm(slope))
-            if size < 1e-9 or best <= 0.0:
+    The direction is that of the signed gradient by finite differences, scaled by the ranges of the joints; the step is
+    halved where it does not help.
+    """
+    low, high = alone.robot.limits.lower, alone.robot.limits.upper
+    span = np.minimum(high - low, 2.0 * np.pi)
+    best, step = float(alone.distances(q)[0]), 0.1
+    for _ in range(STEPS):
+        slope = np.zeros(len(q))
+        for k in range(len(q)):
+            moved = q.copy()
+            change = 1e-4 * span[k] * (1.0 if q[k] + 1e-4 * span[k] <= high[k] else -1.0)
+            moved[k] += change
+            slope[k] = (alone.distances(moved)[0] - best) / change * span[k]
+        size = float(np.linalg.norm(slope))
+        if size < 1e-9 or best <= 0.0:
+            break
+        while step > 1e-4:
+            tried = np.clip(q - step * span * slope / size, low, high)
+            value = float(alone.distances(tried)[0])
+            if value < best - 1e-7:
+                q, best, step = tried, value, min(2.0 * step, 0.2)
                 break
-            while step > 1e-4:
-                tried = np.clip(q - step * span * slope / size, low, high)
-                value = float(self.distances(tried)[0])
-                if value < best - 1e-7:
-                    q, best, step = tried, value, min(2.0 * step, 0.2)
-                    break
-                step *= 0.5
-            else:
-                break
-        return best
+            step *= 0.5
+        else:
+            break
+    return best

@@ -185,25 +185,24 @@ def _made(
     shapes: Mapping[str, coal.CollisionGeometry], effort: int, jobs: int, deadline: float
 ) -> Iterator[Iterator[tuple[str, Cover]]]:
     """Make covers in processes that end at the deadline; yield key and cover as each is done."""
-    global _shapes  # noqa: PLW0603 - processes that are forked have it without a copy
     if not shapes or time.monotonic() >= deadline:
         yield iter(())
         return
-    _shapes = dict(shapes)
-    pool = multiprocessing.get_context("fork").Pool(min(jobs, len(shapes)), _leave_interrupts)
+    pool = multiprocessing.get_context("fork").Pool(min(jobs, len(shapes)), _start, (shapes,))
     try:
         yield _until(deadline, pool.imap_unordered(_make, [(key, effort) for key in shapes]))
     finally:
         pool.terminate()
         pool.join()
-        _shapes = {}
 
 
 _shapes: dict[str, coal.CollisionGeometry] = {}
+"""The shapes in a process that makes covers; being forked, it has them without a copy."""
 
 
-def _leave_interrupts() -> None:
-    """Leave Ctrl-C, which reaches all processes of a terminal, to the one that ends the others."""
+def _start(shapes: Mapping[str, coal.CollisionGeometry]) -> None:
+    """Keep the shapes, and leave Ctrl-C, which reaches all processes of a terminal, to the one that ends the others."""
+    _shapes.update(shapes)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

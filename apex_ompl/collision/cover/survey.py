@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.robot import Robot
-from apex_ompl.robot.config import WIDEST
 from apex_ompl.robot.model import link_of
 from apex_ompl.robot.self_collision import SelfCollision, shares_by_links
 from apex_ompl.scene.meshes import is_watertight, triangles
@@ -124,4 +123,4 @@ def open_meshes(robot: Robot) -> tuple[str, ...]:
 def unlimited_joints(robot: Robot) -> tuple[str, ...]:
     """Return the joints whose range is so wide that it is none."""
     span = robot.limits.upper - robot.limits.lower
-    return tuple(name for name, width in zip(robot.joint_names, span, strict=True) if width > min(WIDE, WIDEST))
+    return tuple(name for name, width in zip(robot.joint_names, span, strict=True) if width > WIDE)
