@@ -17,7 +17,8 @@ import numpy as np
 from apex_ompl.errors import ParameterError
 from apex_ompl.perception.frames import Frame, looks_of, mean_frame
 from apex_ompl.perception.fusion import Sighting, fused
-from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.looking import LookSettings, LookState, World, look_states
 from apex_ompl.perception.obstacle_settings import ObstacleSettings
 from apex_ompl.perception.obstacles import ObstacleFinder, SeenObstacle

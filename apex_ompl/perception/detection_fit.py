@@ -16,7 +16,10 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.perception import Window, draw_triangles
 from apex_ompl.perception.detector import KINDS, KNOWN_TURN, OPEN, DetectedObject
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.held import Expected, HeldObject, HeldObjectFinder, HeldSettings, window_around
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_pixels import window_around
+from apex_ompl.perception.held_settings import HeldSettings
+from apex_ompl.perception.held_shapes import Expected
 from apex_ompl.perception.registration import CorrectedFrame, corrected
 from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.surfaces import RobotSurface, body_surface, inverse
@@ -98,15 +101,11 @@ class DetectionFit:
         depth = seen.depth.copy()
         for item in expected:
             center = (item.pose[:3, 3] - pose[:3, 3]) @ pose[:3, :3]
-            window = window_around(center, self._radius(item), seen.camera)
+            window = window_around(center, self._finder.reach(item), seen.camera)
             if window is not None:
                 self._remove_supports(depth, window, seen)
         fitted = self._finder.find_expected(seen._replace(depth=depth), expected)
         return tuple(_as_detected(it, one) for it, one in zip(fitted, chosen, strict=True))
-
-    def _radius(self, one: Expected) -> float:
-        s = self.settings
-        return one.surface.radius * (1.0 + 2.0 * s.size_spread) + 2.5 * max(s.grasp_shift)
 
     def _remove_supports(self, depth: Array, window: Window, seen: CorrectedFrame) -> None:
         """Put what shows a support in a window of a depth image far away, so that no object covers it."""

@@ -23,7 +23,8 @@ from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import FixedVector, Target, angle_target, offset_target
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import check_camera
-from apex_ompl.perception.held import HeldObject, HeldSettings
+from apex_ompl.perception.held import HeldObject
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.surfaces import RobotSurface, inverse
 from apex_ompl.perception.visibility import ViewPredictor, Visible
 from apex_ompl.robot.model import Robot

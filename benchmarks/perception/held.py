@@ -29,7 +29,8 @@ from tqdm import tqdm
 from apex_ompl.perception.detection_fit import nearest, with_detection
 from apex_ompl.perception.detector import ObjectDetector
 from apex_ompl.perception.frames import Frame, mean_frame
-from apex_ompl.perception.held import INFLATION, HeldObject, HeldObjectFinder
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_shapes import INFLATION
 from apex_ompl.perception.registration import corrected
 from apex_ompl.perception.rendering import Mujoco, Renderer, ZBuffer
 from apex_ompl.perception.surfaces import RobotSurface
@@ -42,7 +43,9 @@ from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
 
 DEPENDS = (
-    "apex_ompl/perception/held.py", "apex_ompl/perception/registration.py", "apex_ompl/perception/frames.py",
+    "apex_ompl/perception/held.py", "apex_ompl/perception/held_fit.py", "apex_ompl/perception/held_pixels.py",
+    "apex_ompl/perception/held_settings.py", "apex_ompl/perception/held_shapes.py",
+    "apex_ompl/perception/registration.py", "apex_ompl/perception/frames.py",
     "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py", "apex_ompl/perception/synthetic.py",
     "apex_ompl/perception/camera.py", "apex_ompl/kernel/compiled/perception", "apex_ompl/kernel/perception.py",
 )  # fmt: skip
@@ -118,7 +121,7 @@ def _with_detector(
     found = detector.find(frame)
     seen = corrected(frame, surface, finder.settings.registration)
     expected = finder.expected(seen.registration.state)
-    near = [nearest(found, one.body.name, one) for one in expected]
+    near = [nearest(found, one.name, one) for one in expected]
     both = [one if it is None else with_detection(one, it) for one, it in zip(expected, near, strict=True)]
     return finder.find_expected(seen, both), time.process_time() - started
 

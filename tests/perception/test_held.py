@@ -11,7 +11,8 @@ import pytest
 from apex_ompl.errors import ApexError
 from apex_ompl.perception.camera import look_at
 from apex_ompl.perception.frames import Frame, mean_frame
-from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.rendering import DepthSensor
 from apex_ompl.perception.synthetic import SceneGenerator, SyntheticScene, SyntheticSettings, TrueObject
 from apex_ompl.problems.objects import DATA
