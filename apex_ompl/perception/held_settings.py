@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from apex_ompl.errors import ParameterError
 from apex_ompl.perception.registration import RegistrationSettings
-from apex_ompl.util.validation import check_number, check_positive
+from apex_ompl.util.validation import check_array, check_integer, check_number, check_positive, finite_array
 
 
 @dataclass(frozen=True)
@@ -54,21 +53,14 @@ class HeldSettings:
             ParameterError: A number is out of its range.
         """
         for name in ("grasp_shift", "grasp_turn"):
-            for value in getattr(self, name):
+            spreads = finite_array(getattr(self, name), name)
+            check_array(spreads, (3,), name)
+            for value in spreads.tolist():
                 check_positive(value, name)
-        for name in (
-            "thickness",
-            "floor",
-            "edge",
-            "point_share",
-            "contour_share",
-            "most_points",
-            "first_points",
-            "least_points",
-            "most_misfit",
-        ):
+        for name in ("thickness", "floor", "edge", "point_share", "contour_share", "most_misfit"):
             check_positive(getattr(self, name), name)
+        for name in ("most_points", "first_points", "least_points"):
+            check_integer(getattr(self, name), name, 1)
         check_number(self.size_spread, "size_spread", 0.0, 1.0)
         check_number(self.least_seen, "least_seen", 0.0, 1.0)
-        if not self.starts:
-            raise ParameterError("starts", self.starts, "one angle or more")
+        check_array(finite_array(self.starts, "starts"), ("N",), "starts", least=1)

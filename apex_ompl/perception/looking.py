@@ -33,6 +33,7 @@ from apex_ompl.scene.constraints import Constraint
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import (
+    check_array,
     check_integer,
     check_number,
     check_positive,
@@ -113,7 +114,9 @@ class LookSettings:
             check_positive(getattr(self, name), name)
         for name in ("frames", "proposals", "predicted", "rounds", "most"):
             check_integer(getattr(self, name), name, 1)
-        low, high = self.distance
+        distance = finite_array(self.distance, "distance")
+        check_array(distance, (2,), "distance")
+        low, high = distance.tolist()
         check_positive(low, "distance")
         check_number(high, "distance", low)
         check_number(self.face_angle, "face_angle", 0.0, np.pi)

@@ -157,6 +157,9 @@ def test_a_frame_without_a_joint_and_bad_settings_are_refused(generator: SceneGe
         finder.find(Frame(frame.camera, frame.depth, joints={}))
     with pytest.raises(ApexError, match="link"):
         finder.find(replace(frame, camera=frame.camera.model_copy(update={"link": "nowhere"})))
-    for settings in ({"grasp_turn": (1.0, -1.0, 1.0)}, {"starts": ()}, {"size_spread": 2.0}, {"edge": float("nan")}):
-        with pytest.raises(ApexError):
+    for settings in (
+        {"grasp_turn": (1.0, -1.0, 1.0)}, {"grasp_shift": (0.01,)}, {"grasp_turn": 4.0}, {"starts": ()},
+        {"starts": (float("nan"),)}, {"size_spread": 2.0}, {"edge": float("nan")}, {"most_points": 0.5},
+    ):  # fmt: skip
+        with pytest.raises(ApexError, match=next(iter(settings))):
             HeldSettings(**settings)  # type: ignore[arg-type]
