@@ -23,6 +23,7 @@ from apex_ompl.perception.held_shapes import Expected
 from apex_ompl.perception.registration import CorrectedFrame, corrected
 from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.surfaces import RobotSurface, body_surface, inverse
+from apex_ompl.robot.compose import WORLD
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body
 from apex_ompl.types import Array
@@ -69,10 +70,8 @@ class DetectionFit:
         self.robot, self.supports = robot, tuple(robot.fixtures if supports is None else supports)
         self.settings = replace(settings or HeldSettings(), grasp_shift=(PLACE_SPREAD,) * 3, starts=TURNS)
         self._surface = RobotSurface(robot)
-        link = self._surface.links[0]
-        self._finder = HeldObjectFinder(
-            robot, [_on_link(kind, one, link) for kind, one in bodies.items()], self.settings
-        )
+        named = [_named(kind, one) for kind, one in bodies.items()]
+        self._finder = HeldObjectFinder(robot, named, self.settings, self._surface)
         self._templates = dict(zip(bodies, self._finder.expected(robot.home), strict=True))
         self._supports = [body_surface(one).at(one.pose) for one in self.supports]
 
@@ -185,8 +184,8 @@ def with_detection(one: Expected, found: DetectedObject) -> Expected:
     return one._replace(pose=pose, covariance=covariance)
 
 
-def _on_link(kind: str, body: Body, link: str) -> AttachedObject:
-    """Return a body with the name of its kind, on a link."""
+def _named(kind: str, body: Body) -> AttachedObject:
+    """Return a body with the name of its kind, that no link of the robot holds."""
     kept = {name: getattr(body, name) for name in ("box", "sphere", "cylinder", "capsule", "mesh")}
     contact = body.contact if isinstance(body, AttachedObject) else None
-    return AttachedObject(name=kind, link=link, contact=contact, **kept)
+    return AttachedObject(name=kind, link=WORLD, contact=contact, **kept)

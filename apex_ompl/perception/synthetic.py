@@ -237,7 +237,7 @@ class SceneGenerator:
             geometry_surface(item.geometry, item.name, LINK_SLICES) for item in robot.geometry.geometryObjects
         ]
         rng = np.random.default_rng(5)
-        shades = rng.uniform(0.55, 0.95, (len(self._surface.links), 1)) * np.ones(3)
+        shades = rng.uniform(0.55, 0.95, (len(self._links), 1)) * np.ones(3)
         self._shades = [(float(r), float(g), float(b)) for r, g, b in shades]
 
     def draw(self, rng: np.random.Generator, settings: SyntheticSettings | None = None) -> SyntheticScene:

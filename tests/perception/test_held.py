@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ApexError
 from apex_ompl.perception.camera import look_at
 from apex_ompl.perception.frames import Frame, mean_frame
 from apex_ompl.perception.held import HeldObject, HeldObjectFinder
 from apex_ompl.perception.held_settings import HeldSettings
-from apex_ompl.perception.rendering import DepthSensor
-from apex_ompl.perception.synthetic import SceneGenerator, SyntheticScene, SyntheticSettings, TrueObject
+from apex_ompl.perception.rendering import DepthSensor, ZBuffer
+from apex_ompl.perception.synthetic import (
+    SceneGenerator,
+    SyntheticScene,
+    SyntheticSettings,
+    TrueObject,
+    default_camera,
+    solid_part,
+)
 from apex_ompl.problems.objects import DATA
-from apex_ompl.robot import Robot
+from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject
 
 
@@ -147,6 +156,31 @@ def test_an_object_far_from_where_the_hand_holds_it_is_no_answer(generator: Scen
             wrong = np.linalg.norm(its.pose[:3, 3] - one.pose[:3, 3]) > 0.01
             answers += not its.reason and not wrong
     assert answers == 0
+
+
+ODD_URDF = """<robot name="odd"><link name="bäse link"/><link name="tool.0"/>
+<joint name="slide/1" type="prismatic"><parent link="bäse link"/><child link="tool.0"/><origin xyz="0 0 0.3"/>
+<axis xyz="0 0 1"/><limit lower="0" upper="0.5" velocity="1" effort="1"/></joint></robot>"""
+ODD_ROBOT = """schema: apex-ompl/robot/1
+name: odd
+parts: [{name: arm, urdf: odd.urdf}]
+joints: {slide/1: {home: 0.1, acceleration: 1, jerk: 10}}
+"""
+
+
+def test_a_robot_without_shapes_and_with_odd_names_holds_what_is_seen(tmp_path: Path) -> None:
+    (tmp_path / "odd.urdf").write_text(ODD_URDF, encoding="utf-8")
+    (tmp_path / "odd.yaml").write_text(ODD_ROBOT)
+    odd = load_robot(str(tmp_path / "odd.yaml"))
+    camera = default_camera(SyntheticSettings()).placed(look_at((0.9, 0.3, 0.8), (0.0, 0.0, 0.45)))
+    held = AttachedObject(name="box", box=(0.1, 0.14, 0.2), position=(0.0, 0.0, 0.05), link="tool.0")
+    true = odd.link_pose(np.array([0.1]), "tool.0") @ held.pose
+    true[:3, :3] = pin.exp3(np.array([0.05, -0.04, 0.08])) @ true[:3, :3]
+    true[:3, 3] += 0.006, -0.005, 0.002
+    view = ZBuffer().draw([solid_part(coal_geometry(held), true, 1, (1.0, 1.0, 1.0))], camera, camera.pose)
+    found = HeldObjectFinder(odd, [held]).find(Frame(camera, view.depth, joints={"slide/1": 0.1}))[0]
+    assert not found.reason
+    np.testing.assert_allclose(found.pose, true, atol=2e-3)
 
 
 def test_a_frame_without_a_joint_and_bad_settings_are_refused(generator: SceneGenerator, robot: Robot) -> None:
