@@ -54,7 +54,6 @@ CALIBRATION_SEEDS = (1001, 1002)
 FRAMES = 9
 SEEN = 0.85
 GATE = (0.0045, 2.2)  # largest own standard deviations of face [m] and axis [degrees]
-RENDERERS = 2  # that draw the same scenes, so that bands are those of half of the objects
 DIMENSIONS = 6
 CHI_SQUARED, MEDIAN = 12.592, 5.348  # 95 % and 50 % of six degrees of freedom
 SHAPES = {"ball": "sphere", "block": "mesh", "box": "box", "can": "cylinder", "cup": "thin mesh", "peg": "slender"}
@@ -200,20 +199,23 @@ def errors_rows(renderer: str, drawn: dict[int, list[Sample]], n: int) -> list[l
     return rows
 
 
-def covariance_rows(found: Sequence[Sample]) -> list[list[Any]]:
-    """Return the rows of normalized squared errors by kind of object."""
+def covariance_rows(found: Sequence[Sample], renderers: int) -> list[list[Any]]:
+    """Return the rows of normalized squared errors by kind of object, of scenes that a number of renderers drew."""
     rows = []
     for method in METHODS:
         for kind in sorted({one.kind for one in found}):
             squared = [s.squared for s in found if s.method == method and s.kind == kind and not s.reason]
             if not squared:
                 continue
-            rows.append([method, kind, *squared_cells(squared, RENDERERS)])
+            rows.append([method, kind, *squared_cells(squared, renderers)])
     return rows
 
 
 def squared_cells(squared: Sequence[float], renderers: int) -> list[Any]:
-    """Return the cells of normalized squared errors of objects that a number of renderers drew alike."""
+    """Return the cells of normalized squared errors of objects that a number of renderers drew alike.
+
+    Errors by renderers of the same scenes are not independent: bands are those of the number of different objects.
+    """
     values, count = np.array(squared), len(squared) / renderers
     low, high = band(count)
     share, slack = float(np.mean(values < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / count)
@@ -246,7 +248,7 @@ def calibrate(made: Robot, n: int) -> None:
         for renderer, seed in zip((ZBuffer(), Mujoco()), CALIBRATION_SEEDS, strict=True)
         for one in samples(made, renderer, seed, n)
     ]
-    print(table(SQUARED, covariance_rows(found)))
+    print(table(SQUARED, covariance_rows(found, 1)))  # each renderer has scenes of its own
     print(table(("shape", "one frame", "means of frames"), inflation_rows(found)))
 
 
@@ -280,7 +282,7 @@ def tables(drawn: dict[str, dict[int, list[Sample]]], n: int) -> tuple[dict[str,
             words = re.sub(r"'[^']*':?|[0-9.]+ ?%?", "", one.reason).strip()
             missed[words] = missed.get(words, 0) + 1
     reasons = [[reason, count] for reason, count in sorted(missed.items(), key=lambda item: -item[1])]
-    covariance = covariance_rows(found)
+    covariance = covariance_rows(found, len(drawn))
     parts = [table(HEAD, rows), table(SQUARED, covariance), table(("no answer, nine frames", "N"), reasons)]
     return {"rows": rows, "covariance": covariance, "samples": compact(found)}, "\n\n".join(parts)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from support import benchmark_script
 
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ApexError
@@ -156,6 +157,24 @@ def test_an_object_far_from_where_the_hand_holds_it_is_no_answer(generator: Scen
             wrong = np.linalg.norm(its.pose[:3, 3] - one.pose[:3, 3]) > 0.01
             answers += not its.reason and not wrong
     assert answers == 0
+
+
+def test_calibration_tells_the_inflation_that_errors_need() -> None:
+    """Squared errors that are ``k`` times those of chi-squared ask for ``k`` times the inflation, whatever is far off."""
+    script, rng = benchmark_script("perception.held"), np.random.default_rng(0)
+    factors = {"ball": 2.0, "cup": 0.5}
+    found = [
+        script.Sample(k, method, kind, 1.0, "", 0.0, 0.0, 0.0, 0.0, squared, 1.0, 0.0)
+        for kind, factor in factors.items()
+        for method in script.METHODS
+        for k, squared in enumerate([*(factor * rng.chisquare(6, 4000)), 1e9])
+    ]
+    rows = {shape: cells for shape, *cells in script.inflation_rows(found)}
+    for kind, shape in script.SHAPES.items():
+        for cell, now in zip(rows[shape], script.INFLATION[shape], strict=True):
+            assert not cell if kind not in factors else abs(float(cell) / now - factors[kind]) < 0.1
+    for _, kind, count, _, _, median, *_ in script.covariance_rows(found, 1):
+        assert count == 4001 and abs(float(median) - factors[kind]) < 0.1
 
 
 ODD_URDF = """<robot name="odd"><link name="bäse link"/><link name="tool.0"/>
