@@ -196,6 +196,13 @@ class SurfaceFit(NamedTuple):
     depth: Array
     triangle: Integers
 
+    @property
+    def pose(self) -> Array:
+        """Pose in the optical frame, shape (4, 4) [m]."""
+        found = np.eye(4)
+        found[:3, :3], found[:3, 3] = self.rotation, self.position
+        return found
+
 
 def fit_surface(
     points: Array, beyond: Array, lens: Array, vertices: Array, faces: Integers, ties: Integers, symmetry: int,

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from apex_ompl.perception.hand_eye import calibrate as calibrate
     from apex_ompl.perception.held import HeldObject as HeldObject
     from apex_ompl.perception.held import HeldObjectFinder as HeldObjectFinder
-    from apex_ompl.perception.held import HeldSettings as HeldSettings
+    from apex_ompl.perception.held_settings import HeldSettings as HeldSettings
     from apex_ompl.perception.looking import LookSettings as LookSettings
     from apex_ompl.perception.looking import LookState as LookState
     from apex_ompl.perception.looking import ObjectView as ObjectView
@@ -62,7 +62,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "detector": "DetectedObject DetectorSettings ObjectDetector",
         "frames": "Frame load_frames mean_frame save_sequence",
         "hand_eye": "Calibration View calibrate",
-        "held": "HeldObject HeldObjectFinder HeldSettings",
+        "held": "HeldObject HeldObjectFinder",
+        "held_settings": "HeldSettings",
         "looking": "LookSettings LookState ObjectView look_plan look_states",
         "obstacle_settings": "ObstacleSettings",
         "obstacles": "ObstacleFinder SeenObstacle",

@@ -17,7 +17,8 @@ import numpy as np
 from apex_ompl.errors import ParameterError
 from apex_ompl.perception.frames import Frame, looks_of, mean_frame
 from apex_ompl.perception.fusion import Sighting, fused
-from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.looking import LookSettings, LookState, World, look_states
 from apex_ompl.perception.obstacle_settings import ObstacleSettings
 from apex_ompl.perception.obstacles import ObstacleFinder, SeenObstacle
@@ -28,7 +29,7 @@ from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Alignment, WorldVector
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_number, check_positive
+from apex_ompl.util.validation import check_integer, check_number, check_positive
 
 LENGTH = 0.05  # of vectors in the world [m]
 MOVED = (np.inf, 10.83, 13.82, 16.27, 18.47, 20.52, 22.46, 24.32)
@@ -65,7 +66,7 @@ class AlignSettings:
         Raises:
             ParameterError: A number is out of its range.
         """
-        check_positive(self.most_obstacles, "most_obstacles")
+        check_integer(self.most_obstacles, "most_obstacles", 1)
         check_positive(self.deviations, "deviations")
         check_number(self.margin, "margin", 0.0)
         check_number(self.least_match, "least_match", 0.0, 1.0)

@@ -16,10 +16,14 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.perception import Window, draw_triangles
 from apex_ompl.perception.detector import KINDS, KNOWN_TURN, OPEN, DetectedObject
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.held import Expected, HeldObject, HeldObjectFinder, HeldSettings, window_around
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_pixels import window_around
+from apex_ompl.perception.held_settings import HeldSettings
+from apex_ompl.perception.held_shapes import Expected
 from apex_ompl.perception.registration import CorrectedFrame, corrected
 from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.surfaces import RobotSurface, body_surface, inverse
+from apex_ompl.robot.compose import WORLD
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject, Body
 from apex_ompl.types import Array
@@ -66,10 +70,8 @@ class DetectionFit:
         self.robot, self.supports = robot, tuple(robot.fixtures if supports is None else supports)
         self.settings = replace(settings or HeldSettings(), grasp_shift=(PLACE_SPREAD,) * 3, starts=TURNS)
         self._surface = RobotSurface(robot)
-        link = self._surface.links[0]
-        self._finder = HeldObjectFinder(
-            robot, [_on_link(kind, one, link) for kind, one in bodies.items()], self.settings
-        )
+        named = [_named(kind, one) for kind, one in bodies.items()]
+        self._finder = HeldObjectFinder(robot, named, self.settings, self._surface)
         self._templates = dict(zip(bodies, self._finder.expected(robot.home), strict=True))
         self._supports = [body_surface(one).at(one.pose) for one in self.supports]
 
@@ -98,15 +100,11 @@ class DetectionFit:
         depth = seen.depth.copy()
         for item in expected:
             center = (item.pose[:3, 3] - pose[:3, 3]) @ pose[:3, :3]
-            window = window_around(center, self._radius(item), seen.camera)
+            window = window_around(center, self._finder.reach(item), seen.camera)
             if window is not None:
                 self._remove_supports(depth, window, seen)
         fitted = self._finder.find_expected(seen._replace(depth=depth), expected)
         return tuple(_as_detected(it, one) for it, one in zip(fitted, chosen, strict=True))
-
-    def _radius(self, one: Expected) -> float:
-        s = self.settings
-        return one.surface.radius * (1.0 + 2.0 * s.size_spread) + 2.5 * max(s.grasp_shift)
 
     def _remove_supports(self, depth: Array, window: Window, seen: CorrectedFrame) -> None:
         """Put what shows a support in a window of a depth image far away, so that no object covers it."""
@@ -186,8 +184,8 @@ def with_detection(one: Expected, found: DetectedObject) -> Expected:
     return one._replace(pose=pose, covariance=covariance)
 
 
-def _on_link(kind: str, body: Body, link: str) -> AttachedObject:
-    """Return a body with the name of its kind, on a link."""
+def _named(kind: str, body: Body) -> AttachedObject:
+    """Return a body with the name of its kind, that no link of the robot holds."""
     kept = {name: getattr(body, name) for name in ("box", "sphere", "cylinder", "capsule", "mesh")}
     contact = body.contact if isinstance(body, AttachedObject) else None
-    return AttachedObject(name=kind, link=link, contact=contact, **kept)
+    return AttachedObject(name=kind, link=WORLD, contact=contact, **kept)

@@ -18,7 +18,9 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.perception.held import NOT_THERE, HeldObject, HeldSettings, turned
+from apex_ompl.perception.held import HeldObject, turned
+from apex_ompl.perception.held_pixels import NOT_THERE
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.registration import CorrectedFrame
 from apex_ompl.perception.surfaces import inverse
 from apex_ompl.types import Array

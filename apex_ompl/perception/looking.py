@@ -23,7 +23,8 @@ from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.kernel import FixedVector, Target, angle_target, offset_target
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import check_camera
-from apex_ompl.perception.held import HeldObject, HeldSettings
+from apex_ompl.perception.held import HeldObject
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.surfaces import RobotSurface, inverse
 from apex_ompl.perception.visibility import ViewPredictor, Visible
 from apex_ompl.robot.model import Robot
@@ -32,6 +33,7 @@ from apex_ompl.scene.constraints import Constraint
 from apex_ompl.types import Array
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import (
+    check_array,
     check_integer,
     check_number,
     check_positive,
@@ -112,7 +114,9 @@ class LookSettings:
             check_positive(getattr(self, name), name)
         for name in ("frames", "proposals", "predicted", "rounds", "most"):
             check_integer(getattr(self, name), name, 1)
-        low, high = self.distance
+        distance = finite_array(self.distance, "distance")
+        check_array(distance, (2,), "distance")
+        low, high = distance.tolist()
         check_positive(low, "distance")
         check_number(high, "distance", low)
         check_number(self.face_angle, "face_angle", 0.0, np.pi)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.util.validation import check_number, check_positive
+from apex_ompl.util.validation import check_array, check_integer, check_number, check_positive, finite_array
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,15 @@ class ObstacleSettings:
         check_number(self.saturation, "saturation", 0.0, 1.0)
         check_number(self.value, "value", 0.0, 1.0)
         check_number(self.cubes, "cubes", 0.0, 0.999)
-        for name in ("smallest", "largest", "least_points", "floor", "edge", "point_share", "contour_share"):
+        for name in ("smallest", "floor", "edge", "point_share", "contour_share"):
             check_positive(getattr(self, name), name)
-        for name in ("tempering", "inflation", "systematic", "most_misfit", "most_points"):
+        for name in ("tempering", "inflation", "systematic", "most_misfit"):
             check_positive(getattr(self, name), name)
-        if not all(a < b for a, b in zip(self.low, self.high, strict=True)):
+        for name in ("least_points", "most_points"):
+            check_integer(getattr(self, name), name, 1)
+        check_number(self.largest, "largest", self.smallest)
+        low, high = finite_array(self.low, "low"), finite_array(self.high, "high")
+        check_array(low, (3,), "low")
+        check_array(high, (3,), "high")
+        if not (low < high).all():
             raise ParameterError("high", self.high, f"numbers above those of low, {self.low}")

@@ -299,6 +299,8 @@ class OccupancyMap:
         if not given.size:
             return found
         check_array(given, ("B", 2, 3), "assume_free")
+        if not (given[:, 0] <= given[:, 1]).all():
+            raise ParameterError("assume_free", given.tolist(), "boxes with a largest corner above the least")
         cells = (given - self.origin) / self.resolution - 0.5
         first = np.clip(np.ceil(cells[:, 0] - 1e-9), 0, self.evidence.shape).astype(int)
         last = np.clip(np.floor(cells[:, 1] + 1e-9) + 1, 0, self.evidence.shape).astype(int)

@@ -106,9 +106,7 @@ class _Found(NamedTuple):
     @property
     def solid(self) -> Solid:
         """The solid that was found."""
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.fit.rotation, self.fit.position
-        return Solid(self.start.kind, self.start.size * self.fit.scale, pose)
+        return Solid(self.start.kind, self.start.size * self.fit.scale, self.fit.pose)
 
     @property
     def evidence(self) -> float:

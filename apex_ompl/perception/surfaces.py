@@ -145,7 +145,6 @@ class RobotSurface:
         normals: Unit normals there, shape (V, 3).
         part: Geometry of each vertex, shape (V,).
         faces: Triangles, shape (F, 3).
-        links: Link of each geometry.
     """
 
     def __init__(self, robot: Robot, slices: int = 12) -> None:
@@ -154,9 +153,8 @@ class RobotSurface:
         items = list(robot.geometry.geometryObjects)
         parts = [geometry_surface(item.geometry, item.name, slices) for item in items]
         self.vertices, self.faces = joined(parts)
-        self.normals = np.concatenate([part.normals() for part in parts])
+        self.normals = np.concatenate([np.empty((0, 3)), *(part.normals() for part in parts)])
         self.part = np.repeat(np.arange(len(parts)), [len(part.vertices) for part in parts])
-        self.links = tuple(str(robot.model.frames[item.parentFrame].name) for item in items)
         self._data = robot.model.createData(), robot.geometry.createData()
 
     def poses(self, state: Array) -> Array:
@@ -164,7 +162,7 @@ class RobotSurface:
         data, placements = self._data
         q = self.robot.to_pinocchio(state)
         pin.updateGeometryPlacements(self.robot.model, data, self.robot.geometry, placements, q)
-        return np.array([one.homogeneous for one in placements.oMg])
+        return np.array([one.homogeneous for one in placements.oMg]).reshape(-1, 4, 4)
 
     def seen_from(self, camera: Array, poses: Array, thicker: float = 0.0) -> Array:
         """Return the vertices in the optical frame of a camera, shape (V, 3) [m].

@@ -23,7 +23,7 @@ from apex_ompl.perception.surfaces import RobotSurface, geometry_surface
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_fields
 from apex_ompl.types import Array, Indices
-from apex_ompl.util.validation import check_number
+from apex_ompl.util.validation import check_integer, check_number
 
 SLICES, LINK_SLICES = 96, 32  # of round surfaces
 PALM = -0.009  # surface of the palm in its frame, along z [m]
@@ -133,7 +133,7 @@ class SyntheticSettings:
         """
         for name in ("camera_shift", "camera_turn", "size_spread", "synergy_spread", "scale_spread"):
             check_number(getattr(self, name), name, 0.0)
-        check_number(self.frames, "frames", 1)
+        check_integer(self.frames, "frames", 1)
         check_number(self.empty, "empty", 0.0, 1.0)
 
 
@@ -237,7 +237,7 @@ class SceneGenerator:
             geometry_surface(item.geometry, item.name, LINK_SLICES) for item in robot.geometry.geometryObjects
         ]
         rng = np.random.default_rng(5)
-        shades = rng.uniform(0.55, 0.95, (len(self._surface.links), 1)) * np.ones(3)
+        shades = rng.uniform(0.55, 0.95, (len(self._links), 1)) * np.ones(3)
         self._shades = [(float(r), float(g), float(b)) for r, g, b in shades]
 
     def draw(self, rng: np.random.Generator, settings: SyntheticSettings | None = None) -> SyntheticScene:

@@ -32,7 +32,7 @@ from apex_ompl.perception.solid_starts import Kind
 from apex_ompl.perception.surfaces import inverse
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array, Indices
-from apex_ompl.util.validation import check_array, check_number, check_positive
+from apex_ompl.util.validation import check_array, check_integer, check_number, check_positive
 
 Mask = NDArray[np.bool_]
 
@@ -86,8 +86,8 @@ class TrackerSettings:
         Raises:
             ParameterError: A number is out of its range.
         """
-        check_number(self.of, "of", 1)
-        check_number(self.births, "births", 1, self.of)
+        check_integer(self.of, "of", 1)
+        check_integer(self.births, "births", 1, self.of)
         for name in ("memory", "longest", "speed", "gate", "view", "slack"):
             check_positive(getattr(self, name), name)
         for name in ("power", "spin", "margin"):

@@ -17,7 +17,8 @@ from apex_ompl.collision.shapes import cloud_of, coal_geometry
 from apex_ompl.kernel.perception import draw_triangles
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.surfaces import RobotSurface, Surface, body_surface, geometry_surface, inverse, joined
 from apex_ompl.robot.model import Robot

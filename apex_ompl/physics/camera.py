@@ -23,7 +23,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.perception.alignment import AlignSettings, SeenTask, vect_align
 from apex_ompl.perception.camera import Camera
 from apex_ompl.perception.frames import Frame
-from apex_ompl.perception.held import HeldSettings
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.obstacle_settings import ObstacleSettings
 from apex_ompl.perception.rig import RED, check_cameras, default_cameras, misplaced, noisy, repeated
 from apex_ompl.perception.twin_camera import TwinCamera

@@ -26,7 +26,9 @@ from tqdm import tqdm
 from apex_ompl.perception.detection_fit import DetectionFit, nearest, with_detection
 from apex_ompl.perception.detector import OPEN, DetectedObject, ObjectDetector
 from apex_ompl.perception.detector_scenes import ObjectScene, ObjectSceneGenerator, SceneObject, matched
-from apex_ompl.perception.held import Expected, HeldObject, HeldObjectFinder, HeldSettings
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_settings import HeldSettings
+from apex_ompl.perception.held_shapes import Expected
 from apex_ompl.perception.registration import RegistrationSettings, corrected
 from apex_ompl.perception.rendering import Mujoco, Renderer, ZBuffer
 from apex_ompl.perception.surfaces import RobotSurface
@@ -45,6 +47,8 @@ DEPENDS = (
     "apex_ompl/perception/detector.py", "apex_ompl/perception/detector_network.py",
     "apex_ompl/perception/detection_fit.py", "apex_ompl/perception/detector_scenes.py",
     "apex_ompl/perception/checkpoints/detector", "apex_ompl/perception/held.py",
+    "apex_ompl/perception/held_fit.py", "apex_ompl/perception/held_pixels.py",
+    "apex_ompl/perception/held_settings.py", "apex_ompl/perception/held_shapes.py",
     "apex_ompl/perception/registration.py", "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py",
     "apex_ompl/perception/synthetic.py", "apex_ompl/perception/camera.py", "apex_ompl/kernel/compiled/perception",
     "apex_ompl/kernel/perception.py",
@@ -184,7 +188,7 @@ class Methods:
         seen = corrected(scene.frame, self._surface, RegistrationSettings())
         expected = finder.expected(seen.registration.state)
         before = time.process_time() - started
-        near = [nearest(found, one.body.name, one) for one in expected]
+        near = [nearest(found, one.name, one) for one in expected]
         unsure = [unknown(one) for one in expected]
         options: dict[str, list[Expected | None]] = {
             f"grasp x{factor} + fit": list(expected),

@@ -29,7 +29,8 @@ from tqdm import tqdm
 from apex_ompl.perception.detection_fit import nearest, with_detection
 from apex_ompl.perception.detector import ObjectDetector
 from apex_ompl.perception.frames import Frame, mean_frame
-from apex_ompl.perception.held import INFLATION, HeldObject, HeldObjectFinder
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_shapes import INFLATION
 from apex_ompl.perception.registration import corrected
 from apex_ompl.perception.rendering import Mujoco, Renderer, ZBuffer
 from apex_ompl.perception.surfaces import RobotSurface
@@ -42,7 +43,9 @@ from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
 
 DEPENDS = (
-    "apex_ompl/perception/held.py", "apex_ompl/perception/registration.py", "apex_ompl/perception/frames.py",
+    "apex_ompl/perception/held.py", "apex_ompl/perception/held_fit.py", "apex_ompl/perception/held_pixels.py",
+    "apex_ompl/perception/held_settings.py", "apex_ompl/perception/held_shapes.py",
+    "apex_ompl/perception/registration.py", "apex_ompl/perception/frames.py",
     "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py", "apex_ompl/perception/synthetic.py",
     "apex_ompl/perception/camera.py", "apex_ompl/kernel/compiled/perception", "apex_ompl/kernel/perception.py",
 )  # fmt: skip
@@ -51,7 +54,6 @@ CALIBRATION_SEEDS = (1001, 1002)
 FRAMES = 9
 SEEN = 0.85
 GATE = (0.0045, 2.2)  # largest own standard deviations of face [m] and axis [degrees]
-RENDERERS = 2  # that draw the same scenes, so that bands are those of half of the objects
 DIMENSIONS = 6
 CHI_SQUARED, MEDIAN = 12.592, 5.348  # 95 % and 50 % of six degrees of freedom
 SHAPES = {"ball": "sphere", "block": "mesh", "box": "box", "can": "cylinder", "cup": "thin mesh", "peg": "slender"}
@@ -118,7 +120,7 @@ def _with_detector(
     found = detector.find(frame)
     seen = corrected(frame, surface, finder.settings.registration)
     expected = finder.expected(seen.registration.state)
-    near = [nearest(found, one.body.name, one) for one in expected]
+    near = [nearest(found, one.name, one) for one in expected]
     both = [one if it is None else with_detection(one, it) for one, it in zip(expected, near, strict=True)]
     return finder.find_expected(seen, both), time.process_time() - started
 
@@ -197,20 +199,23 @@ def errors_rows(renderer: str, drawn: dict[int, list[Sample]], n: int) -> list[l
     return rows
 
 
-def covariance_rows(found: Sequence[Sample]) -> list[list[Any]]:
-    """Return the rows of normalized squared errors by kind of object."""
+def covariance_rows(found: Sequence[Sample], renderers: int) -> list[list[Any]]:
+    """Return the rows of normalized squared errors by kind of object, of scenes that a number of renderers drew."""
     rows = []
     for method in METHODS:
         for kind in sorted({one.kind for one in found}):
             squared = [s.squared for s in found if s.method == method and s.kind == kind and not s.reason]
             if not squared:
                 continue
-            rows.append([method, kind, *squared_cells(squared, RENDERERS)])
+            rows.append([method, kind, *squared_cells(squared, renderers)])
     return rows
 
 
 def squared_cells(squared: Sequence[float], renderers: int) -> list[Any]:
-    """Return the cells of normalized squared errors of objects that a number of renderers drew alike."""
+    """Return the cells of normalized squared errors of objects that a number of renderers drew alike.
+
+    Errors by renderers of the same scenes are not independent: bands are those of the number of different objects.
+    """
     values, count = np.array(squared), len(squared) / renderers
     low, high = band(count)
     share, slack = float(np.mean(values < CHI_SQUARED)), 1.96 * np.sqrt(0.05 * 0.95 / count)
@@ -243,7 +248,7 @@ def calibrate(made: Robot, n: int) -> None:
         for renderer, seed in zip((ZBuffer(), Mujoco()), CALIBRATION_SEEDS, strict=True)
         for one in samples(made, renderer, seed, n)
     ]
-    print(table(SQUARED, covariance_rows(found)))
+    print(table(SQUARED, covariance_rows(found, 1)))  # each renderer has scenes of its own
     print(table(("shape", "one frame", "means of frames"), inflation_rows(found)))
 
 
@@ -277,7 +282,7 @@ def tables(drawn: dict[str, dict[int, list[Sample]]], n: int) -> tuple[dict[str,
             words = re.sub(r"'[^']*':?|[0-9.]+ ?%?", "", one.reason).strip()
             missed[words] = missed.get(words, 0) + 1
     reasons = [[reason, count] for reason, count in sorted(missed.items(), key=lambda item: -item[1])]
-    covariance = covariance_rows(found)
+    covariance = covariance_rows(found, len(drawn))
     parts = [table(HEAD, rows), table(SQUARED, covariance), table(("no answer, nine frames", "N"), reasons)]
     return {"rows": rows, "covariance": covariance, "samples": compact(found)}, "\n\n".join(parts)
 

@@ -64,8 +64,10 @@ from benchmarks.perception.held import compact, squared_cells, squared_error, ta
 
 DEPENDS = (
     "apex_ompl/perception/looking.py", "apex_ompl/perception/visibility.py", "apex_ompl/perception/fusion.py",
-    "apex_ompl/perception/alignment.py", "apex_ompl/perception/held.py", "apex_ompl/perception/registration.py",
-    "apex_ompl/perception/frames.py", "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py",
+    "apex_ompl/perception/alignment.py", "apex_ompl/perception/held.py", "apex_ompl/perception/held_fit.py",
+    "apex_ompl/perception/held_pixels.py", "apex_ompl/perception/held_settings.py",
+    "apex_ompl/perception/held_shapes.py", "apex_ompl/perception/registration.py", "apex_ompl/perception/frames.py",
+    "apex_ompl/perception/rendering.py", "apex_ompl/perception/surfaces.py",
     "apex_ompl/perception/camera.py", "apex_ompl/kernel/compiled/perception", "apex_ompl/kernel/perception.py",
 )  # fmt: skip
 SEEDS = (21, 22)

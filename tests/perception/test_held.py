@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from support import benchmark_script
 
+from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.errors import ApexError
 from apex_ompl.perception.camera import look_at
 from apex_ompl.perception.frames import Frame, mean_frame
-from apex_ompl.perception.held import HeldObject, HeldObjectFinder, HeldSettings
-from apex_ompl.perception.rendering import DepthSensor
-from apex_ompl.perception.synthetic import SceneGenerator, SyntheticScene, SyntheticSettings, TrueObject
+from apex_ompl.perception.held import HeldObject, HeldObjectFinder
+from apex_ompl.perception.held_settings import HeldSettings
+from apex_ompl.perception.rendering import DepthSensor, ZBuffer
+from apex_ompl.perception.synthetic import (
+    SceneGenerator,
+    SyntheticScene,
+    SyntheticSettings,
+    TrueObject,
+    default_camera,
+    solid_part,
+)
 from apex_ompl.problems.objects import DATA
-from apex_ompl.robot import Robot
+from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject
 
 
@@ -148,6 +159,49 @@ def test_an_object_far_from_where_the_hand_holds_it_is_no_answer(generator: Scen
     assert answers == 0
 
 
+def test_calibration_tells_the_inflation_that_errors_need() -> None:
+    """Squared errors that are ``k`` times those of chi-squared ask for ``k`` times the inflation, whatever is far off."""
+    script, rng = benchmark_script("perception.held"), np.random.default_rng(0)
+    factors = {"ball": 2.0, "cup": 0.5}
+    found = [
+        script.Sample(k, method, kind, 1.0, "", 0.0, 0.0, 0.0, 0.0, squared, 1.0, 0.0)
+        for kind, factor in factors.items()
+        for method in script.METHODS
+        for k, squared in enumerate([*(factor * rng.chisquare(6, 4000)), 1e9])
+    ]
+    rows = {shape: cells for shape, *cells in script.inflation_rows(found)}
+    for kind, shape in script.SHAPES.items():
+        for cell, now in zip(rows[shape], script.INFLATION[shape], strict=True):
+            assert not cell if kind not in factors else abs(float(cell) / now - factors[kind]) < 0.1
+    for _, kind, count, _, _, median, *_ in script.covariance_rows(found, 1):
+        assert count == 4001 and abs(float(median) - factors[kind]) < 0.1
+
+
+ODD_URDF = """<robot name="odd"><link name="bäse link"/><link name="tool.0"/>
+<joint name="slide/1" type="prismatic"><parent link="bäse link"/><child link="tool.0"/><origin xyz="0 0 0.3"/>
+<axis xyz="0 0 1"/><limit lower="0" upper="0.5" velocity="1" effort="1"/></joint></robot>"""
+ODD_ROBOT = """schema: apex-ompl/robot/1
+name: odd
+parts: [{name: arm, urdf: odd.urdf}]
+joints: {slide/1: {home: 0.1, acceleration: 1, jerk: 10}}
+"""
+
+
+def test_a_robot_without_shapes_and_with_odd_names_holds_what_is_seen(tmp_path: Path) -> None:
+    (tmp_path / "odd.urdf").write_text(ODD_URDF, encoding="utf-8")
+    (tmp_path / "odd.yaml").write_text(ODD_ROBOT)
+    odd = load_robot(str(tmp_path / "odd.yaml"))
+    camera = default_camera(SyntheticSettings()).placed(look_at((0.9, 0.3, 0.8), (0.0, 0.0, 0.45)))
+    held = AttachedObject(name="box", box=(0.1, 0.14, 0.2), position=(0.0, 0.0, 0.05), link="tool.0")
+    true = odd.link_pose(np.array([0.1]), "tool.0") @ held.pose
+    true[:3, :3] = pin.exp3(np.array([0.05, -0.04, 0.08])) @ true[:3, :3]
+    true[:3, 3] += 0.006, -0.005, 0.002
+    view = ZBuffer().draw([solid_part(coal_geometry(held), true, 1, (1.0, 1.0, 1.0))], camera, camera.pose)
+    found = HeldObjectFinder(odd, [held]).find(Frame(camera, view.depth, joints={"slide/1": 0.1}))[0]
+    assert not found.reason
+    np.testing.assert_allclose(found.pose, true, atol=2e-3)
+
+
 def test_a_frame_without_a_joint_and_bad_settings_are_refused(generator: SceneGenerator, robot: Robot) -> None:
     scene = generator.draw(np.random.default_rng((5, 0)))
     frame = scene.frames[0]
@@ -156,6 +210,9 @@ def test_a_frame_without_a_joint_and_bad_settings_are_refused(generator: SceneGe
         finder.find(Frame(frame.camera, frame.depth, joints={}))
     with pytest.raises(ApexError, match="link"):
         finder.find(replace(frame, camera=frame.camera.model_copy(update={"link": "nowhere"})))
-    for settings in ({"grasp_turn": (1.0, -1.0, 1.0)}, {"starts": ()}, {"size_spread": 2.0}, {"edge": float("nan")}):
-        with pytest.raises(ApexError):
+    for settings in (
+        {"grasp_turn": (1.0, -1.0, 1.0)}, {"grasp_shift": (0.01,)}, {"grasp_turn": 4.0}, {"starts": ()},
+        {"starts": (float("nan"),)}, {"size_spread": 2.0}, {"edge": float("nan")}, {"most_points": 0.5},
+    ):  # fmt: skip
+        with pytest.raises(ApexError, match=next(iter(settings))):
             HeldSettings(**settings)  # type: ignore[arg-type]

@@ -240,7 +240,8 @@ def test_bad_input_is_named(problem: Problem, robot: Robot, start: Array, camera
     refused("state", state=np.full(len(start), np.nan))
     refused("state", state=start[:-1])
     refused("obstacles", world="here")
-    for name, value in {"distance": (0.9, 0.7), "proposals": 0, "place": -1.0, "border": 0.6, "seed": -1}.items():
+    faulty = {"proposals": 0, "place": -1.0, "border": 0.6, "seed": -1}
+    for name, value in (("distance", (0.9, 0.7)), ("distance", (0.9,)), *faulty.items()):
         with pytest.raises(ParameterError, match=name):
             LookSettings(**{name: value})  # type: ignore[arg-type]
     assert AlignSettings().look == LookSettings() and HeldSettings()

@@ -14,7 +14,9 @@ from apex_ompl.perception import Camera, Frame
 from apex_ompl.perception.camera import DepthErrors
 from apex_ompl.perception.frames import looks_of, mean_frame
 from apex_ompl.perception.fusion import Sighting, fused
-from apex_ompl.perception.held import NOT_THERE, HeldObject, HeldSettings
+from apex_ompl.perception.held import HeldObject
+from apex_ompl.perception.held_pixels import NOT_THERE
+from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.registration import CorrectedFrame, Registration
 from apex_ompl.scene.bodies import AttachedObject
 

@@ -298,8 +298,12 @@ def test_bad_sizes_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "fields", [{"hue": 400.0}, {"hue_width": 0.0}, {"largest": -1.0}, {"high": (0.0, -2.0, 0.0)}, {"cubes": 1.0}]
-)
+    "fields",
+    [
+        {"hue": 400.0}, {"hue_width": 0.0}, {"largest": -1.0}, {"largest": 0.01}, {"high": (0.0, -2.0, 0.0)},
+        {"low": (0.0, 0.0)}, {"low": ("a", 0.0, 0.0)}, {"high": 1.0}, {"cubes": 1.0}, {"most_points": 0.5},
+    ],
+)  # fmt: skip
 def test_bad_settings_are_refused(fields: dict[str, float]) -> None:
-    with pytest.raises(ParameterError):
+    with pytest.raises(ParameterError, match=next(iter(fields))):
         ObstacleSettings(**fields)  # type: ignore[arg-type]

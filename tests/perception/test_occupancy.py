@@ -468,6 +468,10 @@ FAULTS: list[tuple[Callable[[OccupancyMap, Robot], Any], str]] = [
     (lambda m, r: OccupancyMap(BOUNDS, SIDE, r).points(goal=[[np.nan] * 3]), "goal"),
     (lambda m, r: m.points(goal=[0.0, 0.4, 0.6]), "robot"),
     (lambda m, r: OccupancyMap(BOUNDS, SIDE, r).world("blocked", r.home, assume_free=[[1.0]]), "assume_free"),
+    (
+        lambda m, r: OccupancyMap(BOUNDS, SIDE, r).world("blocked", r.home, assume_free=[[[1.0] * 3, [0.0] * 3]]),
+        "above",
+    ),
     (lambda m, r: OccupancySettings(support=9), "support"),
     (lambda m, r: m.decay(0), "steps"),
     (lambda m, r: m.clear(((0, 0, 0), (0, 0, 0))), "bounds"),

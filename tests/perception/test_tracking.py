@@ -231,3 +231,5 @@ def test_bad_input_is_refused() -> None:
         tracker.update(2.0, [], None, np.zeros((2, 2), bool))
     with pytest.raises(ParameterError, match="births"):
         TrackerSettings(births=4, of=3)
+    with pytest.raises(ParameterError, match="of"):
+        TrackerSettings(of=2.5)  # type: ignore[arg-type]
