@@ -99,6 +99,31 @@ def test_poses_of_two_hands_are_combined_and_the_largest_clearance_comes_first(r
         ).states)  # fmt: skip
 
 
+def test_states_of_a_region_are_inside_of_it_and_all_over_it(panda: Robot) -> None:
+    pose, turn = pinocchio_pose(panda, panda.home, "hand"), (0.4, 0.9)
+    wanted = target("hand", pose)
+    turned = wanted.model_copy(update={"free_turn": "z", "turn": turn})
+    box = wanted.model_copy(update={"lower": (-0.1, 0.0, -0.05), "upper": (0.1, 0.0, 0.0)})
+    with MotionPlanner(panda) as planner:
+        offs = [pose.actInv(pinocchio_pose(panda, one.state, "hand")) for one in planner.ik(turned)]
+        angles = np.array([pin.log3(off.rotation) for off in offs])
+        assert len(angles) > 100 and np.abs(angles[:, :2]).max() < 1e-6
+        assert turn[0] - 1e-6 <= angles[:, 2].min() < 0.45 and 0.85 < angles[:, 2].max() <= turn[1] + 1e-6
+        offs = [pose.actInv(pinocchio_pose(panda, one.state, "hand")) for one in planner.ik(box)]
+        places = np.array([off.translation for off in offs])
+        assert max(np.linalg.norm(pin.log3(off.rotation)) for off in offs) < 1e-6
+        assert (np.array(box.lower) - 1e-6 <= places).all() and (places <= np.array(box.upper) + 1e-6).all()
+        assert np.ptp(places[:, 0]) > 0.15 and np.ptp(places[:, 2]) > 0.04
+
+
+def test_a_region_is_not_out_of_reach_where_a_part_of_it_is_reached(panda: Robot) -> None:
+    pose = target("hand", pinocchio_pose(panda, panda.home, "hand"))
+    far = pose.model_copy(update={"position": (1.5, 0.0, 0.3), "lower": (-2.0, -0.5, -0.5), "upper": (0.0, 0.5, 0.5)})
+    with MotionPlanner(panda) as planner:
+        assert planner.ik(far)
+        assert "out of reach" in planner.ik(far.model_copy(update={"lower": (-0.3, -0.1, -0.1)})).reason
+
+
 def test_what_stands_in_the_way_is_named_by_share(panda: Robot) -> None:
     pose = pinocchio_pose(panda, panda.home, "hand")
     with MotionPlanner(panda) as planner:
@@ -120,7 +145,11 @@ def test_out_of_reach_is_said_where_the_links_are_too_short(panda: Robot) -> Non
         assert "out of reach" in planner.ik(PoseTarget(frame="hand", position=(1.5, 0.0, 0.3))).reason
         for q in panda.random_state(rng, 30):  # whatever is reached is not said to be out of reach
             pose = target("hand", pinocchio_pose(panda, q, "hand"))
-            for one in (pose, pose.model_copy(update={"orientation": None})):
+            upside_down = target(
+                "hand", pinocchio_pose(panda, q, "hand") * pin.SE3(pin.exp3(np.pi * np.eye(3)[0]), np.zeros(3))
+            )
+            turned = upside_down.model_copy(update={"free_turn": "x"})
+            for one in (pose, pose.model_copy(update={"orientation": None}), turned):
                 assert "out of reach" not in planner.ik(one, descents=1, count=1).reason
 
 
