@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from apex_ompl.planning.checks import ProofResult as ProofResult
+    from apex_ompl.planning.checks import StateCheck as StateCheck
     from apex_ompl.planning.inverse_kinematics import IKResult as IKResult
     from apex_ompl.planning.inverse_kinematics import IKSolution as IKSolution
     from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
-    from apex_ompl.planning.planner import ProofResult as ProofResult
-    from apex_ompl.planning.planner import StateCheck as StateCheck
     from apex_ompl.planning.query import GoalSampler as GoalSampler
     from apex_ompl.planning.steps import FoundPath as FoundPath
     from apex_ompl.planning.steps import PlanQuery as PlanQuery
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "checks": "ProofResult StateCheck",
         "inverse_kinematics": "IKResult IKSolution",
-        "planner": "MotionPlanner ProofResult StateCheck",
+        "planner": "MotionPlanner",
         "query": "GoalSampler",
         "steps": "FoundPath PlanQuery ProvedPath assemble check prove solve time",
         "world": "World",
