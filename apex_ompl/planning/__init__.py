@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from apex_ompl.planning.inverse_kinematics import IKSolution as IKSolution
     from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
     from apex_ompl.planning.query import GoalSampler as GoalSampler
-    from apex_ompl.planning.steps import FoundPath as FoundPath
-    from apex_ompl.planning.steps import PlanQuery as PlanQuery
-    from apex_ompl.planning.steps import ProvedPath as ProvedPath
+    from apex_ompl.planning.step_records import FoundPath as FoundPath
+    from apex_ompl.planning.step_records import PlanQuery as PlanQuery
+    from apex_ompl.planning.step_records import ProvedPath as ProvedPath
     from apex_ompl.planning.steps import assemble as assemble
     from apex_ompl.planning.steps import check as check
     from apex_ompl.planning.steps import prove as prove
@@ -33,7 +33,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "inverse_kinematics": "IKResult IKSolution",
         "planner": "MotionPlanner",
         "query": "GoalSampler",
-        "steps": "FoundPath PlanQuery ProvedPath assemble check prove solve time",
+        "step_records": "FoundPath PlanQuery ProvedPath",
+        "steps": "assemble check prove solve time",
         "world": "World",
     },
 )
