@@ -11,7 +11,18 @@ import pytest
 from scipy.optimize import least_squares
 from small_arm import write_arm
 
-from apex_ompl import ApexError, MotionPlanner, PoseTarget, Robot, load_robot
+from apex_ompl import (
+    ApexError,
+    MotionPlanner,
+    PoseTarget,
+    Problem,
+    Robot,
+    load_problem,
+    load_robot,
+    plan,
+    plan_task,
+)
+from apex_ompl.api import load_environment
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.self_motions import SPACING
 from apex_ompl.planning.inverse_kinematics import IKResult
@@ -182,6 +193,59 @@ def test_named_poses_of_a_robot_file_are_states(tmp_path: Path) -> None:
         file.write_text(file.read_text().rsplit("poses", 1)[0] + faulty)
         with pytest.raises(ApexError, match="poses|pose 'ready'"):
             load_robot(file)
+
+
+POSED = """schema: apex-ompl/problem/1
+name: posed
+robot: small_arm.robot.yaml
+start: home
+goal: {joints: ready}
+after: [{kind: move, goal: {any_of: [{joints: [home, {turn: 0.1, shoulder: 0.4, elbow: 0.6}]}]}}]
+"""
+
+
+def test_named_poses_stand_for_joint_values_in_problem_files(tmp_path: Path) -> None:
+    robot_file = write_arm(tmp_path)
+    robot_file.write_text(robot_file.read_text() + "poses: {ready: {turn: 0.5}}\n")
+    file = tmp_path / "posed.yaml"
+    file.write_text(POSED)
+    problem, robot = load_problem(file), load_robot(robot_file)
+    assert np.array_equal(problem.start_state(robot.joint_names), robot.home)
+    assert np.array_equal(problem.goal_states(robot.joint_names), [robot.poses["ready"]])
+    assert problem.after[0].goal.any_of[0].joints[0] == dict(zip(robot.joint_names, robot.home, strict=True))
+    done = plan_task(file, timeout=20.0)
+    assert done and np.array_equal(done.path.states[0], robot.home) and done.steps[-1].kind == "move"
+    assert "home" not in done.problem.to_yaml() and load_problem(file) == problem
+    assert np.array_equal(load_environment(file).problem.start_state(robot.joint_names), robot.home)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("start: home", "start: hme", r"posed.yaml: start: unknown pose, did you mean 'home'\?, got 'hme'"),
+        ("joints: ready", "joints: [ready, elsewhere]", r"goal.joints.1: unknown pose, known: home, ready"),
+        ("[home, {turn", "[hme, {turn", r"after.0.goal.any_of.0.joints.0: unknown pose"),
+        ("joints: ready", "any_of: []", "any_of: .*at least 1 item"),
+        ("joints: ready", "any_of: [{joints: home}, {joints: {turn: 1.0}}]", "joint 'shoulder' is missing"),
+        ("joints: ready", "any_of: [{any_of: [{joints: home}]}]", "no any_of inside of any_of"),
+        ("joints: ready", "any_of: [home]", "goal.any_of.0: .*got 'home'"),
+        ("start: home", "start: [0.1, 0.2, 0.3]", "start: .*dictionary"),
+        ("small_arm.robot.yaml", "3", "posed.yaml: robot: "),
+        ("small_arm.robot.yaml", "smal_arm", "unknown robot 'smal_arm'"),
+    ],
+)
+def test_faulty_names_in_problem_files_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    robot_file = write_arm(tmp_path)
+    robot_file.write_text(robot_file.read_text() + "poses: {ready: {turn: 0.5}}\n")
+    file = tmp_path / "posed.yaml"
+    file.write_text(POSED.replace(old, new, 1))
+    with pytest.raises(ApexError, match=message):
+        plan(file, timeout=5.0)
+
+
+def test_a_problem_that_knows_no_robot_says_who_reads_names() -> None:
+    with pytest.raises(ApexError, match=r"start: expected values by joint name; .* apex_ompl.load_problem"):
+        Problem.parse({"name": "posed", "robot": "panda", "start": "home", "goal": {"joints": "home"}}, "posed")
 
 
 @pytest.mark.parametrize(
