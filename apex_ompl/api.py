@@ -14,8 +14,10 @@ from apex_ompl.apex.parameters import NAME
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.planners import AnyPlanner
-from apex_ompl.planning.planner import PlanKeywords, PlanOptions, check_arguments, kept_planner
+from apex_ompl.planning.options import PlanKeywords, PlanOptions, check_arguments
+from apex_ompl.planning.planner import kept_planner
 from apex_ompl.result import PlanResult
+from apex_ompl.robot.model import named_poses
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing
 from apex_ompl.util.files import is_file, path_text
@@ -48,11 +50,11 @@ def load_problem(name_or_path: str | os.PathLike[str]) -> Problem:
     if problems.is_id(text):
         return problems.load(text)
     if is_file(Path(text)) or text.endswith((".yaml", ".yml")):
-        return Problem.load(text)
+        return Problem.load(text, named_poses)
     suite, *levels = text.split("/")
     if levels and suite in problems.suites():
         raise ParameterError("problem", text, f"an id such as {suite}/{problems.suites()[suite][0]}/12, or a file")
-    return Problem.load(text) if os.sep in text else problems.load(text)
+    return Problem.load(text, named_poses) if os.sep in text else problems.load(text)
 
 
 @unforked()

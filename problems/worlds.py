@@ -31,6 +31,7 @@ from apex_ompl import problems
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.problems.alignment import SAMPLERS, SIZES
 from apex_ompl.problems.catalogue import MOVING, SPLITS, ProblemId
+from apex_ompl.robot.model import named_poses
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import fastest, is_there, obstacle_at, recorded
@@ -248,7 +249,7 @@ def load(name: str) -> DynamicEnvironment:
     """
     kind, *rest = name.split("/")
     if name.endswith((".yaml", ".yml")) or Path(name).is_absolute():
-        return environment_of(Problem.load(name))
+        return environment_of(Problem.load(name, named_poses))
     if kind not in GENERATED and (problems.is_id(name) or name in problems.names()):
         return environment_of(problems.load(name))
     if not rest:

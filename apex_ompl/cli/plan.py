@@ -13,7 +13,7 @@ from apex_ompl.cli.options import LIMITS, name_value_pairs, numbers_by_name
 from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.planning.planner import check_arguments
+from apex_ompl.planning.options import check_arguments
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.planning.tasks import task_fault
 from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus

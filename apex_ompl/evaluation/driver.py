@@ -29,7 +29,7 @@ from apex_ompl.evaluation.results import ABOUT, RUNS, SCHEMA, Results
 from apex_ompl.evaluation.rows import Job, Row, jobs
 from apex_ompl.evaluation.runs import CRASH, RESULT, Run, job_columns, run, unsolved, warm_up
 from apex_ompl.paths.path import SEARCH_RESOLUTION
-from apex_ompl.planning.planner import check_arguments
+from apex_ompl.planning.options import check_arguments
 from apex_ompl.util.cluster import spread
 from apex_ompl.util.files import locked, make_folder, write_atomically
 from apex_ompl.util.provenance import hardware, versions

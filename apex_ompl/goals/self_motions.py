@@ -7,7 +7,7 @@ closes or meets a joint limit. Between its states the joint that moves most move
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,15 +39,24 @@ class SelfMotions:
         curves: Number of the curve of each, shape (N,); states of arms with more than one redundant joint, which are
             drawn at random, have one each.
         descents: Number of descents from random states.
-        reached: Number of those that reached the poses.
-        missed: Where the others ended, shape (M, dof).
+        missed: Where those ended that did not reach the poses, shape (M, dof).
     """
 
     states: Array
     curves: NDArray[np.intp]
     descents: int
-    reached: int
     missed: Array
+
+    @classmethod
+    def together(cls, found: Sequence[SelfMotions]) -> SelfMotions:
+        """Return what several searches found, with the curves numbered on."""
+        numbers = np.cumsum([0, *(int(one.curves.max(initial=-1)) + 1 for one in found)])
+        return cls(
+            np.concatenate([one.states for one in found]),
+            np.concatenate([one.curves + first for one, first in zip(found, numbers[:-1], strict=True)]),
+            sum(one.descents for one in found),
+            np.concatenate([one.missed for one in found]),
+        )
 
 
 def search(
@@ -65,7 +74,7 @@ def search(
     """
     free = inverse.free
     states, curves, missed = list[Array](), list[int](), list[Array]()
-    attempts = reached = idle = number = 0
+    attempts = idle = number = 0
     while attempts < descents and idle < IDLE and len(states) < most:
         seeds = np.tile(base, (min(BATCH, descents - attempts), 1))
         first = 1 if attempts == 0 else 0
@@ -76,7 +85,6 @@ def search(
             if not error <= REACHED:
                 missed.append(q)
                 continue
-            reached += 1
             redundant = _redundancy(inverse, q)
             near = SPACING if redundant else SAME
             if states and (np.abs(np.array(states) - q).max(axis=1) <= near).any():
@@ -89,7 +97,7 @@ def search(
             number += 1
     shape = (-1, len(base))
     return SelfMotions(
-        np.array(states).reshape(shape), np.array(curves, np.intp), attempts, reached, np.array(missed).reshape(shape)
+        np.array(states).reshape(shape), np.array(curves, np.intp), attempts, np.array(missed).reshape(shape)
     )
 
 

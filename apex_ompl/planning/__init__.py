@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 from apex_ompl.util.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from apex_ompl.planning.checks import ProofResult as ProofResult
+    from apex_ompl.planning.checks import StateCheck as StateCheck
     from apex_ompl.planning.inverse_kinematics import IKResult as IKResult
     from apex_ompl.planning.inverse_kinematics import IKSolution as IKSolution
     from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
-    from apex_ompl.planning.planner import ProofResult as ProofResult
-    from apex_ompl.planning.planner import StateCheck as StateCheck
     from apex_ompl.planning.query import GoalSampler as GoalSampler
-    from apex_ompl.planning.steps import FoundPath as FoundPath
-    from apex_ompl.planning.steps import PlanQuery as PlanQuery
-    from apex_ompl.planning.steps import ProvedPath as ProvedPath
+    from apex_ompl.planning.step_records import FoundPath as FoundPath
+    from apex_ompl.planning.step_records import PlanQuery as PlanQuery
+    from apex_ompl.planning.step_records import ProvedPath as ProvedPath
     from apex_ompl.planning.steps import assemble as assemble
     from apex_ompl.planning.steps import check as check
     from apex_ompl.planning.steps import prove as prove
@@ -29,10 +29,12 @@ if TYPE_CHECKING:
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
     {
+        "checks": "ProofResult StateCheck",
         "inverse_kinematics": "IKResult IKSolution",
-        "planner": "MotionPlanner ProofResult StateCheck",
+        "planner": "MotionPlanner",
         "query": "GoalSampler",
-        "steps": "FoundPath PlanQuery ProvedPath assemble check prove solve time",
+        "step_records": "FoundPath PlanQuery ProvedPath",
+        "steps": "assemble check prove solve time",
         "world": "World",
     },
 )

@@ -28,7 +28,8 @@ from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
 from apex_ompl.paths.path import Path
-from apex_ompl.planning.steps import FoundPath, PlanQuery, constraint_fields, finish, prove, query_fault, solve, time
+from apex_ompl.planning.step_records import FoundPath, PlanQuery, constraint_fields
+from apex_ompl.planning.steps import finish, prove, query_fault, solve, time
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere

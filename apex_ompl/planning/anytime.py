@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,14 +19,12 @@ from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
 from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, assemble, workspace_goal
 from apex_ompl.paths.path import SEARCH_RESOLUTION, resample
 from apex_ompl.planning.query import goal_record
+from apex_ompl.planning.step_records import PlanQuery
 from apex_ompl.robot.model import Limits
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline
-
-if TYPE_CHECKING:
-    from apex_ompl.planning.steps import PlanQuery
 
 TREE_RANGE, ITERATIONS = 1.5, 6_000  # longest step of trees [rad], and most iterations
 KNOTS = 0.02  # by which motions take longer than direct ones for the spacing of their knots [s]
@@ -141,7 +138,7 @@ class OtherPaths:
         moving = [name for k, name in enumerate(names) if k not in setup.held]
         seed = int(self._rng.integers(MOST_SEED))
         other = assemble(setup.problem.model_copy(update=ends), setup.robot, seed, setup.checker, moving)
-        query = steps.PlanQuery(
+        query = PlanQuery(
             other, self.query.planner, self._parameters.changed(seed=seed, sprint=0),
             Deadline(SHARE * self.query.deadline.remaining), interrupt=self.query.interrupt,
         )  # fmt: skip

@@ -1,7 +1,8 @@
 """Inverse kinematics in a world: free states that reach poses, one for each branch, or why there is none.
 
 Poses of frames that share no joint, such as those of two hands, are solved one after the other and combined. The states
-of a redundant arm are those along its self-motions (:mod:`apex_ompl.goals.self_motions`).
+of a redundant arm are those along its self-motions (:mod:`apex_ompl.goals.self_motions`). Of a region, these are the
+self-motions at poses that are drawn in it (:func:`apex_ompl.goals.pose_goal.pose_goals`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.frames import Frame
 from apex_ompl.constraints.links import Links
 from apex_ompl.errors import ParameterError
-from apex_ompl.goals.pose_goal import PoseGoal
+from apex_ompl.goals.pose_goal import pose_goals
 from apex_ompl.goals.self_motions import DESCENT_STEPS, EXACT, REACHED, SelfMotions, search
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
@@ -132,7 +133,7 @@ def solve(
         if far := part.out_of_reach():
             return IKResult((), far, 0, 0)
     rng = np.random.default_rng(seed)
-    found = [search(part.inverse, robot.limits, base, rng, descents=descents, most=MOST_STATES) for part in parts]
+    found = [part.search(rng, descents) for part in parts]
     tried = sum(one.descents for one in found)
     for part, motions in zip(parts, found, strict=True):
         if not len(motions.states):
@@ -203,10 +204,21 @@ class _Part:
         fixed: NDArray[np.intp],
     ) -> None:
         self.robot, self.base, self.fixed = robot, base, fixed
-        self.goal = PoseGoal(robot, poses, held, base)
+        goals = pose_goals(robot, poses, held, base)
+        self.goal = goals[0]
         hands = [robot.joint_names.index(h.synergy) for h in robot.hands.values() if h.synergy is not None]
         self.stays = np.array(sorted({*fixed.tolist(), *hands}), np.intp)
-        self.inverse = Links.of(robot).inverse(self.goal.targets(), self.stays)
+        self.inverses = [Links.of(robot).inverse(goal.targets(), self.stays) for goal in goals]
+        self.inverse = self.inverses[0]
+
+    def search(self, rng: np.random.Generator, descents: int) -> SelfMotions:
+        """Return states that reach the poses; of a region, in equal shares for the poses drawn in it."""
+        share = -(-descents // len(self.inverses)), MOST_STATES // len(self.inverses)
+        found = [
+            search(inverse, self.robot.limits, self.base, rng, descents=share[0], most=share[1])
+            for inverse in self.inverses
+        ]
+        return SelfMotions.together(found)
 
     @property
     def names(self) -> str:
@@ -248,9 +260,11 @@ def _too_far(robot: Robot, pose: PoseTarget, frame: Frame, base: Array, free: ND
     """Return why a pose is out of reach by the length of the links, or nothing.
 
     The distance between the origins of the first and the last moved joint is at most the sum of the offsets between
-    joints in between; an orientation that is given places the origin of the last one, and otherwise the frame's own.
+    joints in between; an orientation that is given without a free turn places the origin of the last one, and otherwise
+    the frame's own.
     """
-    model, number, whole = robot.model, robot.link_frame(frame.link), pose.orientation is not None and not frame.axial
+    model, number = robot.model, robot.link_frame(frame.link)
+    whole = pose.orientation is not None and pose.free_turn is None and not frame.axial
     data = model.createData()
     pin.framesForwardKinematics(model, data, robot.to_pinocchio(base))
     chain, joint = list[int](), int(model.frames[number].parentJoint)
@@ -265,12 +279,14 @@ def _too_far(robot: Robot, pose: PoseTarget, frame: Frame, base: Array, free: ND
     length = sum(float(np.linalg.norm(model.jointPlacements[j].translation)) for j in chain[moved[0] + 1 :])
     local = np.array(model.frames[number].placement.homogeneous) @ frame.pose
     wanted, slack = np.asarray(pose.position, float), pose.tolerance.position
-    if pose.orientation is not None and whole:
-        wanted = (pose_matrix(pose.position, pose.orientation) @ np.linalg.inv(local))[:3, 3]
+    at = pose_matrix(pose.position, pose.orientation or (0.0, 0.0, 0.0, 1.0))
+    if whole:
+        wanted = (at @ np.linalg.inv(local))[:3, 3]
         slack += pose.tolerance.angle * float(np.linalg.norm(local[:3, 3]))
     else:
         length += float(np.linalg.norm(local[:3, 3]))
-    distance = float(np.linalg.norm(wanted - data.oMi[first].translation))
+    away = at[:3, :3].T @ (data.oMi[first].translation - wanted)
+    distance = float(np.linalg.norm(away - np.clip(away, pose.lower, pose.upper)))
     if distance <= length + slack + ROUNDING:
         return ""
     what = pose.frame if last == first or not whole else f"the joint {model.names[last]}"

@@ -25,7 +25,7 @@ from apex_ompl.ompl.setup import state_fault
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.line_query import LineQuery
-from apex_ompl.planning.steps import certificate
+from apex_ompl.planning.step_records import certificate
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import digest
 from apex_ompl.timing import Timing, Trajectory, time_path

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import FullCheck, MotionValidator, StateValidityChecker, full_check
 from apex_ompl.paths.path import SEARCH_RESOLUTION, Path
 from apex_ompl.planning.anytime import TREE_RANGE, OtherPaths, tree_path
+from apex_ompl.planning.step_records import PlanQuery
 from apex_ompl.robot.model import Limits
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.timing import MotionLimits, TimedPath, Timing, Trajectory
@@ -31,9 +32,6 @@ from apex_ompl.timing.ruckig_method import calm as calm_motion
 from apex_ompl.timing.spline_method import whole_nanoseconds
 from apex_ompl.timing.timed_spline import TimedSpline
 from apex_ompl.types import Array
-
-if TYPE_CHECKING:
-    from apex_ompl.planning.steps import PlanQuery
 
 OPTIMIZED = "optimized"  # form of a motion that is not along a path
 REPAIRS = 3  # of a motion that is not proved

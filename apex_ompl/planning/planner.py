@@ -7,28 +7,29 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Sequence, Set
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields, replace
-from math import nan
+from dataclasses import replace
 from pathlib import Path as FilePath
-from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Self, Unpack
 
 from apex_ompl import planners
 from apex_ompl.errors import ParameterError
+from apex_ompl.planning.options import OPTIONS, PlanKeywords, PlanOptions, ProblemKeywords, check_arguments
 from apex_ompl.util.display import one_line
 from apex_ompl.util.forking import ProcessLock, unforked
 from apex_ompl.util.process import running
-from apex_ompl.util.validation import check_flag, check_integer, check_number, check_options, check_positive, check_seed
+from apex_ompl.util.validation import check_integer, check_options, check_seed
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from ompl import geometric as og
 
-    from apex_ompl.collision import CollisionChecker, Contact
+    from apex_ompl.collision import CollisionChecker
     from apex_ompl.constraints.user import UserConstraint
     from apex_ompl.paths.path import Path
     from apex_ompl.planners import AnyPlanner
+    from apex_ompl.planning.checks import ProofResult, StateCheck
     from apex_ompl.planning.inverse_kinematics import IKResult
     from apex_ompl.planning.line_query import Waypoint
     from apex_ompl.planning.lines import LineResult
@@ -44,131 +45,6 @@ if TYPE_CHECKING:
 
 MOST_IDLE = 4  # planners of a robot that are kept
 _Stamps = tuple[int, ...]
-
-
-@dataclass(frozen=True)
-class PlanOptions:
-    """Options of a plan, see :func:`apex_ompl.plan` and :meth:`apex_ompl.MotionPlanner.plan`."""
-
-    timeout: float = 5.0
-    seed: int = 0
-    simplify: bool = True
-    params: Mapping[str, Any] | None = None
-    snapshot: bool = False
-    timing: bool | Timing = True
-    objective: str = "time"
-    calm_factor: float = 1.1
-    group: Group | None = None
-    leave_contact: float = 0.0
-    constraints: Sequence[Constraint | UserConstraint] = ()
-
-    def check(self) -> None:
-        """Check the values that need no robot.
-
-        Raises:
-            ParameterError: One is faulty.
-        """
-        from apex_ompl.planning.departure import LARGEST_DEPTH
-        from apex_ompl.timing import Timing
-        from apex_ompl.timing.duration import check_objective
-
-        check_objective(self.objective, self.calm_factor)
-        check_arguments(self.timeout, self.seed)
-        check_number(self.leave_contact, "leave_contact", 0.0, LARGEST_DEPTH)
-        check_flag(self.simplify, "simplify")
-        check_flag(self.snapshot, "snapshot")
-        if not isinstance(self.timing, (bool, Timing)):
-            raise ParameterError("timing", self.timing, "True, False or a Timing")
-
-
-OPTIONS = tuple(field.name for field in fields(PlanOptions))
-
-
-class PlanKeywords(TypedDict, total=False):
-    """:class:`PlanOptions` as keywords of :meth:`apex_ompl.MotionPlanner.plan`, for editors and type checkers."""
-
-    timeout: float
-    seed: int
-    simplify: bool
-    params: Mapping[str, Any] | None
-    snapshot: bool
-    timing: bool | Timing
-    objective: str
-    calm_factor: float
-    leave_contact: float
-    constraints: Sequence[Constraint | UserConstraint]
-
-
-class ProblemKeywords(PlanKeywords, total=False):
-    """:class:`PlanOptions` as keywords of :meth:`apex_ompl.MotionPlanner.plan_problem`."""
-
-    group: Group | None
-
-
-def check_arguments(timeout: float, seed: int) -> None:
-    """Check what every plan needs.
-
-    Raises:
-        ParameterError: ``timeout`` is not a positive number of seconds, or ``seed`` not a whole number from 0.
-    """
-    check_positive(timeout, "timeout", "a positive number of seconds")
-    check_seed(seed)
-
-
-@dataclass(frozen=True)
-class StateCheck:
-    """Outcome of :meth:`MotionPlanner.check`; true for a state that is inside the limits and free.
-
-    Attributes:
-        reason: Why it is neither, in one sentence; empty for a valid state.
-        clearance: Distance of the nearest pair of bodies that is checked [m], the negative depth where they overlap.
-        contacts: Pairs that overlap, the deepest first.
-    """
-
-    reason: str
-    clearance: float
-    contacts: tuple[Contact, ...]
-
-    def __bool__(self) -> bool:
-        """Whether the state is valid."""
-        return not self.reason
-
-    def __repr__(self) -> str:
-        """Return whether the state is valid, why it is not, and the clearance."""
-        found = "valid" if self else f"invalid: {self.reason}"
-        return one_line("StateCheck", found, f"clearance {1e3 * self.clearance:.2f} mm")
-
-
-@dataclass(frozen=True, eq=False)
-class ProofResult:
-    """Outcome of :meth:`MotionPlanner.prove`; true for a path or a motion that is proved.
-
-    Attributes:
-        reason: Why it is not, in one sentence with the place; empty for one that is proved.
-        segment: Number k of the segment between the states k and k + 1 of a path that fails, or None.
-        time: When a motion fails [s], NaN for a path.
-        state: The state that collides, shape (dof,), or None where another fault was found first.
-        clearance: Least distance of a pair of bodies along it [m], NaN where it was not determined.
-        clearance_bound: Proved lower bound of it [m]; 0 without a proof.
-        clearance_pair: The two bodies there; empty where there are none.
-    """
-
-    reason: str
-    segment: int | None
-    time: float
-    state: Array | None
-    clearance: float
-    clearance_bound: float
-    clearance_pair: tuple[str, str]
-
-    def __bool__(self) -> bool:
-        """Whether it is proved."""
-        return not self.reason
-
-    def __repr__(self) -> str:
-        """Return whether it is proved, why it is not, and the clearance."""
-        found = "proved" if self else f"not proved: {self.reason}"
-        return one_line("ProofResult", found, f"clearance {1e3 * self.clearance:.2f} mm")
 
 
 class MotionPlanner:
@@ -312,7 +188,7 @@ class MotionPlanner:
             given = PlanOptions(**options)
 
             def plan_to(goals: Problem, timeout: float, first: bool) -> PlanResult:
-                now = given if first else _from_rest(given)
+                now = given if first else given.from_rest()
                 return self._plan(goals, planner, time.perf_counter(), replace(now, timeout=timeout))
 
             return plan_task(self._checker, problem, given, plan_to)
@@ -434,9 +310,7 @@ class MotionPlanner:
         check_arguments(timeout, 0)
         with running(), self._lock:
             with unforked():
-                changing = [obstacle.name for obstacle in self._checker.changing_obstacles if obstacle.moving]
-                if changing:
-                    raise ParameterError("world", f"the moving obstacle {changing[0]!r}", "obstacles that stand still")
+                self._check_nothing_moves()
                 checker = self._checker_without(self._absent())
                 checker.check_counts = CheckCounts()
                 query = line_query(
@@ -504,13 +378,12 @@ class MotionPlanner:
         Raises:
             ParameterError: The state has not the robot's joints.
         """
-        from apex_ompl.ompl.setup import state_fault
+        from apex_ompl.planning.checks import check_state
         from apex_ompl.planning.query import state_array
 
         q = state_array(self.robot, state, "state")
         with self._lock:
-            checker = self._checker_now()
-            return StateCheck(state_fault(checker, q), checker.clearance(q), tuple(checker.contacts(q)))
+            return check_state(self._checker_now(), q)
 
     def fk(self, state: State, frame: str) -> Array:
         """Return the pose of a frame in the world at a state, shape (4, 4) [m].
@@ -592,21 +465,11 @@ class MotionPlanner:
             ParameterError: It has not the robot's joints, or a number that is not finite.
             ApexError: A constraint is faulty.
         """
-        from apex_ompl.planning.user_path import prove
+        from apex_ompl.planning.checks import prove
 
         with running(), self._lock:
-            changing = [obstacle.name for obstacle in self._checker.changing_obstacles if obstacle.moving]
-            if changing:
-                raise ParameterError("world", f"the moving obstacle {changing[0]!r}", "obstacles that stand still")
-            check = prove(self._checker_now(), path, lambda start: self.problem(start, start), constraints)
-        proof = check.proof
-        if proof is None:
-            return ProofResult(check.reason, check.segment, nan, None, nan, 0.0, ("", ""))
-        time = proof.parameter if not check and check.segment is None else nan
-        return ProofResult(
-            check.reason, check.segment, time, None if check else proof.state, proof.clearance, proof.clearance_bound,
-            proof.pair,
-        )  # fmt: skip
+            self._check_nothing_moves()
+            return prove(self._checker_now(), path, lambda start: self.problem(start, start), constraints)
 
     @property
     def checker(self) -> CollisionChecker:
@@ -645,6 +508,16 @@ class MotionPlanner:
         """Return a checker of the world at time 0."""
         return self._checker_without(self._absent())
 
+    def _check_nothing_moves(self) -> None:
+        """Check that no obstacle moves.
+
+        Raises:
+            ParameterError: One does.
+        """
+        for obstacle in self._checker.changing_obstacles:
+            if obstacle.moving:
+                raise ParameterError("world", f"the moving obstacle {obstacle.name!r}", "obstacles that stand still")
+
     def _absent(self) -> set[str]:
         """Return the names of the obstacles that are not there at time 0."""
         changing = self._checker.changing_obstacles
@@ -674,14 +547,6 @@ class MotionPlanner:
         made = CollisionChecker(self.robot, scene.values(), held.values(), pairs)
         self._left = made if kept else self._left
         return made
-
-
-def _from_rest(options: PlanOptions) -> PlanOptions:
-    """Return the options of a later motion of a task: from rest, without contact to leave, and unconstrained."""
-    timing = options.timing
-    if not isinstance(timing, bool):
-        timing = replace(timing, start_velocity=(), start_acceleration=(), minimum_duration=0.0)
-    return replace(options, timing=timing, leave_contact=0.0, constraints=())
 
 
 def _check_is_no_line(problem: Problem) -> None:

@@ -21,7 +21,7 @@ from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.ompl.process import Interrupt, quiet_ompl
 from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.planning.planner import PlanOptions
+from apex_ompl.planning.options import PlanOptions
 from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepFailed, StepPlan, StepPlanner

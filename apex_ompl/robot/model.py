@@ -304,6 +304,16 @@ def load_robot(name_or_path: str | Path, relative_to: Path | None = None) -> Rob
     return build_robot(read_config(path), path)
 
 
+def named_poses(name_or_path: str) -> dict[str, dict[str, float]]:
+    """Return the named poses of a robot: name -> joint name -> value.
+
+    Raises:
+        ApexError: As :func:`load_robot`.
+    """
+    robot = load_robot(name_or_path)
+    return {name: dict(zip(robot.joint_names, q.tolist(), strict=True)) for name, q in robot.poses.items()}
+
+
 def bare_robot(name_or_path: str) -> tuple[Robot, RobotConfig, Path]:
     """Return a robot without its files of disabled pairs and covers, which may not exist yet, and its own file.
 

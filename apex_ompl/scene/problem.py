@@ -8,12 +8,21 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PositiveFloat, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PositiveFloat,
+    PrivateAttr,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from apex_ompl.errors import FileFormatError, ParameterError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located, pose_matrix
@@ -39,11 +48,28 @@ SCHEMA = "apex-ompl/problem/1"
 GOALS = ("joints", "alignment", "poses", "any_of")
 """Kinds of goals."""
 
-JointValues = dict[str, float]
+Poses = Mapping[str, Mapping[str, float]]
+"""Named poses of a robot: name -> joint name -> value."""
+
+
+def _posed(value: Any, info: ValidationInfo) -> Any:
+    """Return the values of a pose in place of its name."""
+    if not isinstance(value, str):
+        return value
+    if info.context is None:
+        raise ValueError("expected values by joint name; names of poses are read by apex_ompl.load_problem")
+    poses = info.context()
+    if value not in poses:
+        raise ValueError(f"unknown pose, {_hint(value, poses)}")
+    return dict(poses[value])
+
+
+JointValues = Annotated[dict[str, float], BeforeValidator(_posed, json_schema_input_type=dict[str, float] | str)]
+"""Joint name -> value; in files the name of a pose of the robot, too."""
 
 
 def _one_or_many(value: Any) -> Any:
-    return [value] if isinstance(value, Mapping) else value
+    return [value] if isinstance(value, str | Mapping) else value
 
 
 class WorldVector(StrictModel):
@@ -357,17 +383,20 @@ class Problem(StrictModel):
         return np.array(rows).reshape(-1, len(joint_names))
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Problem:
-        """Read a problem file; the paths of meshes and of a robot file become absolute.
+    def load(cls, path: str | os.PathLike[str], poses_of: Callable[[str], Poses] | None = None) -> Problem:
+        """Read a problem file; its paths become absolute, and ``poses_of`` returns the named poses of a robot.
 
         Raises:
             MissingFileError: The file, or a mesh that it names, cannot be read.
             FileFormatError: The file does not follow the schema; the message names the field.
         """
         path = Path(path_text(path))
-        data = read_yaml(path, "problem file")
+        data, folder = read_yaml(path, "problem file"), path.resolve().parent
         check_version(data, SCHEMA, path)
-        return cls.parse(data, str(path))._located(path.resolve().parent)
+        poses = None if poses_of is None else partial(_poses, poses_of, data.get("robot"), folder)
+        problem = validate(cls, data, str(path), poses)
+        problem._file = str(path)
+        return problem._located(folder)
 
     @classmethod
     def parse(cls, data: dict[str, Any], source: str) -> Problem:
@@ -406,9 +435,17 @@ class Problem(StrictModel):
             "scene": tuple(located(o, folder) for o in self.scene),
             "attached": tuple(located(o, folder) for o in self.attached),
         }
-        if self.robot.endswith((".yaml", ".yml")):
-            update["robot"] = os.path.normpath(folder / self.robot)
-        return self.model_copy(update=update)
+        return self.model_copy(update=update | {"robot": _robot_file(self.robot, folder)})
+
+
+def _robot_file(robot: str, folder: Path) -> str:
+    """Return the name of a robot, or the path of its file from that in a folder."""
+    return os.path.normpath(folder / robot) if robot.endswith((".yaml", ".yml")) else robot
+
+
+def _poses(poses_of: Callable[[str], Poses], robot: Any, folder: Path) -> Poses:
+    """Return the named poses of the robot of a file; none where its field is faulty, which is reported then."""
+    return poses_of(_robot_file(robot, folder)) if isinstance(robot, str) else {}
 
 
 def with_lines(problem: Problem) -> Problem:
@@ -440,12 +477,15 @@ def _with_lines(step: AnyStep) -> list[AnyStep]:
     return [step.model_copy(update={"goal": step.goal.before_approach}), *lines]
 
 
+def _hint(name: str, known: Iterable[str]) -> str:
+    near = nearest_name(name, known)
+    return f"did you mean {near!r}?" if near else f"known: {', '.join(known)}"
+
+
 def _in_order(values: Mapping[str, float], joint_names: Sequence[str], source: str, field: str) -> Array:
     unknown = [name for name in values if name not in joint_names]
     if unknown:
-        near = nearest_name(unknown[0], joint_names)
-        hint = f"did you mean {near!r}?" if near else f"known: {', '.join(joint_names)}"
-        raise FileFormatError(source, field, unknown[0], f"unknown joint, {hint}")
+        raise FileFormatError(source, field, unknown[0], f"unknown joint, {_hint(unknown[0], joint_names)}")
     missing = [name for name in joint_names if name not in values]
     if missing:
         raise FileFormatError(

@@ -343,14 +343,20 @@ def parse_yaml(text: str, source: str) -> dict[str, Any]:
     return data
 
 
-def validate(model: type[ModelT], data: dict[str, Any], source: str) -> ModelT:
+def validate(model: type[ModelT], data: dict[str, Any], source: str, context: Any = None) -> ModelT:
     """Return a record made from ``data``; the error describes the first fault in one sentence.
+
+    Args:
+        model: The class of the record.
+        data: Its fields.
+        source: The file, for errors.
+        context: What validators of the class need besides.
 
     Raises:
         FileFormatError: ``data`` does not fit ``model``.
     """
     with _first_fault(model, source):
-        return super(StrictModel, model).model_validate(data)
+        return super(StrictModel, model).model_validate(data, context=context)
 
 
 @contextmanager

@@ -96,7 +96,8 @@ def _code(member: Any) -> CodeType | None:
 def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
-    from apex_ompl.planning.planner import check_arguments, kept_planner
+    from apex_ompl.planning.options import check_arguments
+    from apex_ompl.planning.planner import kept_planner
     from apex_ompl.scene import OnPlane
 
     robot = apex_ompl.load_robot("dual_panda_softhand")

@@ -14,10 +14,9 @@ from apex_ompl import MotionPlanner, load_problem, plan
 from apex_ompl.apex.stages import Anytime
 from apex_ompl.goals.alignment import alignment_goal
 from apex_ompl.ompl.setup import assemble
-from apex_ompl.planning import check, prove, solve
+from apex_ompl.planning import PlanQuery, check, prove, solve
 from apex_ompl.planning import time as time_step
 from apex_ompl.planning.anytime import OtherPaths
-from apex_ompl.planning.steps import PlanQuery
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.rest_to_rest import direct_durations

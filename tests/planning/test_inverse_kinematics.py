@@ -11,7 +11,18 @@ import pytest
 from scipy.optimize import least_squares
 from small_arm import write_arm
 
-from apex_ompl import ApexError, MotionPlanner, PoseTarget, Robot, load_robot
+from apex_ompl import (
+    ApexError,
+    MotionPlanner,
+    PoseTarget,
+    Problem,
+    Robot,
+    load_problem,
+    load_robot,
+    plan,
+    plan_task,
+)
+from apex_ompl.api import load_environment
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.self_motions import SPACING
 from apex_ompl.planning.inverse_kinematics import IKResult
@@ -99,6 +110,31 @@ def test_poses_of_two_hands_are_combined_and_the_largest_clearance_comes_first(r
         ).states)  # fmt: skip
 
 
+def test_states_of_a_region_are_inside_of_it_and_all_over_it(panda: Robot) -> None:
+    pose, turn = pinocchio_pose(panda, panda.home, "hand"), (0.4, 0.9)
+    wanted = target("hand", pose)
+    turned = wanted.model_copy(update={"free_turn": "z", "turn": turn})
+    box = wanted.model_copy(update={"lower": (-0.1, 0.0, -0.05), "upper": (0.1, 0.0, 0.0)})
+    with MotionPlanner(panda) as planner:
+        offs = [pose.actInv(pinocchio_pose(panda, one.state, "hand")) for one in planner.ik(turned)]
+        angles = np.array([pin.log3(off.rotation) for off in offs])
+        assert len(angles) > 100 and np.abs(angles[:, :2]).max() < 1e-6
+        assert turn[0] - 1e-6 <= angles[:, 2].min() < 0.45 and 0.85 < angles[:, 2].max() <= turn[1] + 1e-6
+        offs = [pose.actInv(pinocchio_pose(panda, one.state, "hand")) for one in planner.ik(box)]
+        places = np.array([off.translation for off in offs])
+        assert max(np.linalg.norm(pin.log3(off.rotation)) for off in offs) < 1e-6
+        assert (np.array(box.lower) - 1e-6 <= places).all() and (places <= np.array(box.upper) + 1e-6).all()
+        assert np.ptp(places[:, 0]) > 0.15 and np.ptp(places[:, 2]) > 0.04
+
+
+def test_a_region_is_not_out_of_reach_where_a_part_of_it_is_reached(panda: Robot) -> None:
+    pose = target("hand", pinocchio_pose(panda, panda.home, "hand"))
+    far = pose.model_copy(update={"position": (1.5, 0.0, 0.3), "lower": (-2.0, -0.5, -0.5), "upper": (0.0, 0.5, 0.5)})
+    with MotionPlanner(panda) as planner:
+        assert planner.ik(far)
+        assert "out of reach" in planner.ik(far.model_copy(update={"lower": (-0.3, -0.1, -0.1)})).reason
+
+
 def test_what_stands_in_the_way_is_named_by_share(panda: Robot) -> None:
     pose = pinocchio_pose(panda, panda.home, "hand")
     with MotionPlanner(panda) as planner:
@@ -120,7 +156,11 @@ def test_out_of_reach_is_said_where_the_links_are_too_short(panda: Robot) -> Non
         assert "out of reach" in planner.ik(PoseTarget(frame="hand", position=(1.5, 0.0, 0.3))).reason
         for q in panda.random_state(rng, 30):  # whatever is reached is not said to be out of reach
             pose = target("hand", pinocchio_pose(panda, q, "hand"))
-            for one in (pose, pose.model_copy(update={"orientation": None})):
+            upside_down = target(
+                "hand", pinocchio_pose(panda, q, "hand") * pin.SE3(pin.exp3(np.pi * np.eye(3)[0]), np.zeros(3))
+            )
+            turned = upside_down.model_copy(update={"free_turn": "x"})
+            for one in (pose, pose.model_copy(update={"orientation": None}), turned):
                 assert "out of reach" not in planner.ik(one, descents=1, count=1).reason
 
 
@@ -153,6 +193,59 @@ def test_named_poses_of_a_robot_file_are_states(tmp_path: Path) -> None:
         file.write_text(file.read_text().rsplit("poses", 1)[0] + faulty)
         with pytest.raises(ApexError, match="poses|pose 'ready'"):
             load_robot(file)
+
+
+POSED = """schema: apex-ompl/problem/1
+name: posed
+robot: small_arm.robot.yaml
+start: home
+goal: {joints: ready}
+after: [{kind: move, goal: {any_of: [{joints: [home, {turn: 0.1, shoulder: 0.4, elbow: 0.6}]}]}}]
+"""
+
+
+def test_named_poses_stand_for_joint_values_in_problem_files(tmp_path: Path) -> None:
+    robot_file = write_arm(tmp_path)
+    robot_file.write_text(robot_file.read_text() + "poses: {ready: {turn: 0.5}}\n")
+    file = tmp_path / "posed.yaml"
+    file.write_text(POSED)
+    problem, robot = load_problem(file), load_robot(robot_file)
+    assert np.array_equal(problem.start_state(robot.joint_names), robot.home)
+    assert np.array_equal(problem.goal_states(robot.joint_names), [robot.poses["ready"]])
+    assert problem.after[0].goal.any_of[0].joints[0] == dict(zip(robot.joint_names, robot.home, strict=True))
+    done = plan_task(file, timeout=20.0)
+    assert done and np.array_equal(done.path.states[0], robot.home) and done.steps[-1].kind == "move"
+    assert "home" not in done.problem.to_yaml() and load_problem(file) == problem
+    assert np.array_equal(load_environment(file).problem.start_state(robot.joint_names), robot.home)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("start: home", "start: hme", r"posed.yaml: start: unknown pose, did you mean 'home'\?, got 'hme'"),
+        ("joints: ready", "joints: [ready, elsewhere]", r"goal.joints.1: unknown pose, known: home, ready"),
+        ("[home, {turn", "[hme, {turn", r"after.0.goal.any_of.0.joints.0: unknown pose"),
+        ("joints: ready", "any_of: []", "any_of: .*at least 1 item"),
+        ("joints: ready", "any_of: [{joints: home}, {joints: {turn: 1.0}}]", "joint 'shoulder' is missing"),
+        ("joints: ready", "any_of: [{any_of: [{joints: home}]}]", "no any_of inside of any_of"),
+        ("joints: ready", "any_of: [home]", "goal.any_of.0: .*got 'home'"),
+        ("start: home", "start: [0.1, 0.2, 0.3]", "start: .*dictionary"),
+        ("small_arm.robot.yaml", "3", "posed.yaml: robot: "),
+        ("small_arm.robot.yaml", "smal_arm", "unknown robot 'smal_arm'"),
+    ],
+)
+def test_faulty_names_in_problem_files_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    robot_file = write_arm(tmp_path)
+    robot_file.write_text(robot_file.read_text() + "poses: {ready: {turn: 0.5}}\n")
+    file = tmp_path / "posed.yaml"
+    file.write_text(POSED.replace(old, new, 1))
+    with pytest.raises(ApexError, match=message):
+        plan(file, timeout=5.0)
+
+
+def test_a_problem_that_knows_no_robot_says_who_reads_names() -> None:
+    with pytest.raises(ApexError, match=r"start: expected values by joint name; .* apex_ompl.load_problem"):
+        Problem.parse({"name": "posed", "robot": "panda", "start": "home", "goal": {"joints": "home"}}, "posed")
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,12 @@ from support import ROOT
 
 from apex_ompl import Obstacle
 from apex_ompl.apex.parameters import ApexKeywords, ApexParameters
-from apex_ompl.planning.planner import PlanKeywords, PlanOptions, ProblemKeywords
+from apex_ompl.planning.options import PlanKeywords, PlanOptions, ProblemKeywords
 from apex_ompl.planning.world import ObstacleFields
 
 SOURCES = (
-    "api.py", "planning/planner.py", "planning/world.py", "apex/planner.py", "apex/parameters.py",
-    "ompl/parameters.py",
+    "api.py", "planning/options.py", "planning/planner.py", "planning/world.py", "apex/planner.py",
+    "apex/parameters.py", "ompl/parameters.py",
 )  # fmt: skip
 RECORDS = ("scene/bodies.py", "scene/problem.py", "util/schema.py")
 USE = """

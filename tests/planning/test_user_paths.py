@@ -76,6 +76,8 @@ def test_faulty_paths_are_named(planner: MotionPlanner, robot: Robot) -> None:
     for path in (robot.home, np.empty((0, robot.dof)), np.full((2, robot.dof), np.nan), [[1.0, 2.0]], "home", ["hme"]):
         with pytest.raises(ApexError, match=r"path|unknown pose"):
             planner.prove(path)
+    with pytest.raises(ApexError, match="path: expected several states, a Path or a Trajectory"):
+        planner.prove("home")
     motion = time_path(swing(robot, 0.2), robot.limits, robot.joint_names).trajectory
     with pytest.raises(ApexError, match="a motion of the 16 joints"):
         planner.prove(motion.selected(robot.joint_names[:2]))
