@@ -140,6 +140,8 @@ class AnyGoal:
             )  # fmt: skip
             attempts += each
             there = ends.states[ends.errors <= 10.0 * single.TOLERANCE]
+            if isinstance(goal, PoseGoal) and not goal.residual_decides:
+                there = there[[within(goal.errors(q), goal.bounds) for q in there]]
             converged += len(there)
             reached[k] = len(there) > 0
             free = there[checker.are_free(there)] if len(there) else there

@@ -21,6 +21,7 @@ from apex_ompl.util.forking import ProcessLock
 
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
 DRAWN = 24  # poses that stand for a region
+TURNING = 6  # joints with which an arm reaches turns that are drawn
 RESIDUAL = 1e-6  # largest residual at which inverse kinematics ends
 
 
@@ -90,6 +91,11 @@ class PoseGoal:
             bounds[f"angle of {pose.frame}"] = pose.tolerance.angle
         return bounds
 
+    @property
+    def residual_decides(self) -> bool:
+        """Whether the poses are reached where the residual is 0: not with a range of angles of which none is drawn."""
+        return all(pose.turn is None for pose in self._drawn)
+
     def targets(self) -> list[Target]:
         """Return the residuals of inverse kinematics; distances are weighted by ``POSITION_WEIGHT``."""
         links, targets = Links.of(self.robot), []
@@ -115,6 +121,9 @@ def pose_goals(
 ) -> list[PoseGoal]:  # fmt: skip
     """Return the goal of poses; where they are regions, goals of the nearest poses to the start and of drawn ones.
 
+    A turn in a range is drawn, too, where there are joints enough to reach it; otherwise it stays free, and the errors
+    tell whether it is in range.
+
     Args:
         robot: The robot.
         poses: The poses.
@@ -128,15 +137,18 @@ def pose_goals(
     if all(pose.is_exact for pose in poses):
         return [goal]
     rng, goals = np.random.default_rng(0), list[PoseGoal]()
-    placed = goal.placements(goal.start)
+    placed, turns = goal.placements(goal.start), len(goal.inverse.free) >= TURNING
     for k in range(DRAWN):
-        drawn = [_drawn(pose, found, rng if k else None) for pose, found in zip(poses, placed, strict=True)]
+        drawn = [_drawn(pose, found, rng if k else None, turns) for pose, found in zip(poses, placed, strict=True)]
         goals.append(PoseGoal(robot, poses, attached, start, drawn))
     return goals
 
 
-def _drawn(pose: PoseTarget, placed: Array, rng: np.random.Generator | None) -> PoseTarget:
-    """Return a pose drawn from the region of another one, or without ``rng`` the one nearest to where the frame is."""
+def _drawn(pose: PoseTarget, placed: Array, rng: np.random.Generator | None, turns: bool) -> PoseTarget:
+    """Return a pose drawn from the region of another one, or without ``rng`` the one nearest to where the frame is.
+
+    Its turn is drawn with ``turns`` alone.
+    """
     wanted = pose_matrix(pose.position, pose.orientation or (0.0, 0.0, 0.0, 1.0))
     lower, upper = np.array(pose.lower), np.array(pose.upper)
     inside = np.clip(product(wanted[:3, :3].T, (placed[:3, 3] - wanted[:3, 3])[:, None])[:, 0], lower, upper)
@@ -146,7 +158,7 @@ def _drawn(pose: PoseTarget, placed: Array, rng: np.random.Generator | None) -> 
         "position": tuple((product(wanted[:3, :3], inside[:, None])[:, 0] + wanted[:3, 3]).tolist()),
         "lower": (0.0, 0.0, 0.0), "upper": (0.0, 0.0, 0.0),
     }  # fmt: skip
-    if pose.turn is not None and pose.free_turn is not None:
+    if turns and pose.turn is not None and pose.free_turn is not None:
         k = "xyz".index(pose.free_turn)
         by = float(np.clip(_twist(product(wanted[:3, :3].T, placed[:3, :3]), k), *pose.turn))
         by = by if rng is None else float(rng.uniform(*pose.turn))

@@ -27,7 +27,7 @@ DESCENT_STEPS, CORRECTOR_STEPS = 60, 8
 SINGULAR = 1e-3  # singular values below this share of the largest count as 0
 BATCH = 32  # descents at once
 IDLE = 64  # descents that reach the poses in a row without a new curve, after which the search ends
-SAME = 1e-3  # distance up to which states of an arm that is not redundant are one [rad]
+SAME = 1e-3  # distance up to which states of an arm that is not redundant, or of two searches, are one [rad]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +49,15 @@ class SelfMotions:
 
     @classmethod
     def together(cls, found: Sequence[SelfMotions]) -> SelfMotions:
-        """Return what several searches found, with the curves numbered on."""
-        numbers = np.cumsum([0, *(int(one.curves.max(initial=-1)) + 1 for one in found)])
-        return cls(
-            np.concatenate([one.states for one in found]),
-            np.concatenate([one.curves + first for one, first in zip(found, numbers[:-1], strict=True)]),
-            sum(one.descents for one in found),
-            np.concatenate([one.missed for one in found]),
-        )
+        """Return what several searches found, each state once, with the curves numbered on."""
+        states, curves = found[0].states, found[0].curves
+        for one in found[1:]:
+            away = [np.abs(states - q).max(axis=1, initial=0.0).min(initial=np.inf) for q in one.states]
+            apart = np.array(away) > SAME
+            states = np.concatenate([states, one.states[apart]])
+            curves = np.concatenate([curves, one.curves[apart] + curves.max(initial=-1) + 1])
+        missed = np.concatenate([one.missed for one in found])
+        return cls(states, curves, sum(one.descents for one in found), missed)
 
 
 def search(

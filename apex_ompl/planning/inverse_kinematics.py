@@ -20,6 +20,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.frames import Frame
 from apex_ompl.constraints.links import Links
 from apex_ompl.errors import ParameterError
+from apex_ompl.goals.alignment import within
 from apex_ompl.goals.pose_goal import pose_goals
 from apex_ompl.goals.self_motions import DESCENT_STEPS, EXACT, REACHED, SelfMotions, search
 from apex_ompl.robot import Robot
@@ -204,20 +205,22 @@ class _Part:
         fixed: NDArray[np.intp],
     ) -> None:
         self.robot, self.base, self.fixed = robot, base, fixed
-        goals = pose_goals(robot, poses, held, base)
-        self.goal = goals[0]
+        self.goals = pose_goals(robot, poses, held, base)
+        self.goal = self.goals[0]
         hands = [robot.joint_names.index(h.synergy) for h in robot.hands.values() if h.synergy is not None]
         self.stays = np.array(sorted({*fixed.tolist(), *hands}), np.intp)
-        self.inverses = [Links.of(robot).inverse(goal.targets(), self.stays) for goal in goals]
+        self.inverses = [Links.of(robot).inverse(goal.targets(), self.stays) for goal in self.goals]
         self.inverse = self.inverses[0]
 
     def search(self, rng: np.random.Generator, descents: int) -> SelfMotions:
         """Return states that reach the poses; of a region, in equal shares for the poses drawn in it."""
-        share = -(-descents // len(self.inverses)), MOST_STATES // len(self.inverses)
-        found = [
-            search(inverse, self.robot.limits, self.base, rng, descents=share[0], most=share[1])
-            for inverse in self.inverses
-        ]
+        each, most, found = -(-descents // len(self.goals)), MOST_STATES // len(self.goals), list[SelfMotions]()
+        for goal, inverse in zip(self.goals, self.inverses, strict=True):
+            one = search(inverse, self.robot.limits, self.base, rng, descents=each, most=most)
+            if not goal.residual_decides:
+                inside = np.array([within(goal.errors(q), goal.bounds) for q in one.states], bool)
+                one = replace(one, states=one.states[inside], curves=one.curves[inside])
+            found.append(one)
         return SelfMotions.together(found)
 
     @property

@@ -9,8 +9,20 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
+from small_arm import write_arm
 
-from apex_ompl import AnyOf, ApexError, MotionPlanner, PlanStatus, PoseTarget, Problem, Robot, plan, plan_task
+from apex_ompl import (
+    AnyOf,
+    ApexError,
+    MotionPlanner,
+    PlanStatus,
+    PoseTarget,
+    Problem,
+    Robot,
+    load_robot,
+    plan,
+    plan_task,
+)
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
@@ -137,6 +149,21 @@ def test_a_box_and_a_range_of_angles_bound_the_pose_in_its_own_frame(robot: Robo
         moved = wanted * pin.SE3(pin.exp3(np.array([0.0, 0.0, turn])), np.array(by))
         q = PoseGoal(robot, [target(moved)], (), robot.home).nearest(robot.home)
         assert max(members[0].errors(q).values()) == pytest.approx(error, abs=1e-5)
+
+
+def test_an_arm_of_few_joints_reaches_ranges_of_angles(tmp_path: Path) -> None:
+    robot = load_robot(write_arm(tmp_path))
+    q = np.array([0.7, 0.4, 0.6])
+    at = robot.link_pose(q, "lower")
+    by = pin.Quaternion(at[:3, :3] @ pin.exp3(np.array([0.0, 0.0, -0.2])))  # the wanted turn is 0.2
+    wanted = PoseTarget(frame="lower", position=tuple(at[:3, 3]), orientation=tuple(by.coeffs()), free_turn="z")
+    inside, outside = (wanted.model_copy(update={"turn": turn}) for turn in ((0.0, 0.3), (-0.3, 0.0)))
+    with MotionPlanner(robot) as planner:
+        found = planner.plan("home", inside, timeout=20.0)
+        assert found and np.allclose(found.path.states[-1], q, atol=1e-4)
+        assert np.allclose(planner.ik(inside).states, q, atol=1e-4) and len(planner.ik(inside)) == 1
+        assert planner.plan("home", outside, timeout=20.0).status is PlanStatus.INVALID_GOAL
+        assert not planner.ik(outside)
 
 
 def test_a_region_near_the_start_needs_a_shorter_motion_than_its_middle(robot: Robot) -> None:
