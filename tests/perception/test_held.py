@@ -160,7 +160,7 @@ def test_an_object_far_from_where_the_hand_holds_it_is_no_answer(generator: Scen
 
 
 def test_calibration_tells_the_inflation_that_errors_need() -> None:
-    """Squared errors that are ``k`` times those of chi-squared ask for ``k`` times the inflation, whatever is far off."""
+    """Squared errors that are ``k`` times those of chi-squared ask for ``k`` times the inflation."""
     script, rng = benchmark_script("perception.held"), np.random.default_rng(0)
     factors = {"ball": 2.0, "cup": 0.5}
     found = [
