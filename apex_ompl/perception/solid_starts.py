@@ -17,6 +17,7 @@ Kind = Literal["box", "cylinder"]
 
 SAME_WAY = np.cos(np.radians(22.0))  # of normals of a plane
 SAME_AXIS = np.cos(np.radians(10.0))  # of cylinders
+PARALLEL = 1e-8  # squared sine between two directions that count as one
 SQUARE = 0.5  # cosine between normals of different sides
 THICK = 0.012  # distance from a plane of its points [m]
 THIN, THICK_SHARE = 0.35, 0.8  # shares of the width of what may be the depth of a box, and of what surely is
@@ -104,8 +105,10 @@ def starts(extent: Array, places: Array, normals: Array) -> list[Solid]:
 
 
 def _frame(first: Array, second: Array) -> Array:
-    """Return a rotation whose x is the first vector and whose y is in the plane of both."""
+    """Return a rotation whose x is the first vector and whose y is in the plane of both, if they are not parallel."""
     y = second - (second @ first) * first
+    if y @ y < PARALLEL:
+        y = _cross(first, np.eye(3)[int(np.argmin(np.abs(first)))])
     y /= np.sqrt(y @ y)
     return np.stack([first, y, _cross(first, y)], axis=1)
 

@@ -23,7 +23,7 @@ from apex_ompl.perception.color_parts import Color, color_parts  # noqa: E402
 from apex_ompl.perception.obstacle_settings import ObstacleSettings  # noqa: E402
 from apex_ompl.perception.obstacles import ObstacleFinder, SeenObstacle  # noqa: E402
 from apex_ompl.perception.solid_fit import Estimate, KnownSize, mixture  # noqa: E402
-from apex_ompl.perception.solid_starts import Solid  # noqa: E402
+from apex_ompl.perception.solid_starts import Solid, starts  # noqa: E402
 
 CAMERA = Camera(width=320, height=240, focal=(232.0, 232.0), center=(159.5, 119.5), depth=DepthErrors())
 EYE = look_at((1.0, 0.1, 0.9), (0.3, 0.0, 0.3))
@@ -271,6 +271,17 @@ def test_a_mixture_has_the_moments_of_its_samples() -> None:
     np.testing.assert_allclose([*found.solid.pose[:3, 3], *found.solid.size], drawn.mean(axis=0), atol=1e-3)
     scale = np.array([1.0, 1.0, 1.0, *found.solid.size])
     np.testing.assert_allclose(found.covariance[3:, 3:] * np.outer(scale, scale), np.cov(drawn.T), atol=3e-5)
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.3, -0.2, 0.5)])
+def test_starts_on_points_of_a_line_are_solids(direction: tuple[float, float, float]) -> None:
+    """A strip of one row of pixels: its planes have no normal of their own."""
+    places = np.array([0.1, 0.0, 0.8]) + np.linspace(0.0, 0.05, 12)[:, None] * np.array(direction)
+    for normals in (np.tile([0.0, 0.0, -1.0], (12, 1)), np.eye(3)[[0] * 6 + [2] * 6], np.zeros((0, 3))):
+        given = places if len(normals) else places[:0]
+        for one in starts(places, given, normals):
+            assert np.allclose(one.pose[:3, :3] @ one.pose[:3, :3].T, np.eye(3), atol=1e-9)
+            assert np.linalg.det(one.pose[:3, :3]) > 0.0 and (one.size > 0.0).all() and np.isfinite(one.pose).all()
 
 
 def test_hues_are_those_of_colorsys() -> None:
