@@ -58,7 +58,7 @@ def _plane(places: Array, normals: Array) -> Array | None:
             break
         own = places[near] - places[near].mean(axis=0)
         found = np.linalg.eigh(own.T @ own)[1][:, 0]
-        mean = found * np.sign(found @ mean)
+        mean = found if found @ mean >= 0.0 else -found
     return np.asarray(mean)
 
 
@@ -119,10 +119,11 @@ def _turned(frame: Array, angle: float) -> Array:
 
 
 def _longest(points: Array, normal: Array) -> Array:
-    """Return the direction across a normal in which points extend most."""
+    """Return the direction across a normal in which points extend most; any across it for points on a line along it."""
     flat = points - points.mean(axis=0)
     flat = flat - (flat @ normal)[:, None] * normal
-    return np.asarray(np.linalg.eigh(flat.T @ flat)[1][:, 2])
+    found = np.linalg.eigh(flat.T @ flat)[1][:, 2]
+    return np.asarray(_frame(normal, found)[:, 1])
 
 
 def _squared(points: Array, normal: Array) -> Array:
