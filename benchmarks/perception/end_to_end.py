@@ -55,7 +55,7 @@ PARTS = TASKS, WORLDS = "tasks", "worlds"
 TOLD, SEEN = WAYS = "told", "seen"
 PROBLEMS = ("stack_boxes", "handover", "pour", "peg_in_hole", "ball_in_cup")
 SEED = 10_001  # of the first task
-TIMEOUT, RUN_TIMEOUT = 60.0, 10.0  # of a plan, and of a run in a world [s]
+TIMEOUT, RUN_TIMEOUT = 20.0, 10.0  # of a plan, and of a run in a world [s]
 IDEAL = Sensor(rate=100.0, age=0.0, noise=0.0, dropout=0.0)
 HEAD = ("what", "pairs", "failed told %", "failed seen %", "only told", "only seen", "difference % (95 %)")
 
