@@ -8,7 +8,8 @@ off by the spreads of a calibration), with looks from other states where somethi
 told as they are. Tasks are judged by where the objects are at the end (:mod:`apex_ompl.physics.judges`), and fail where
 anything touched the cube. **Worlds**: the loop among obstacles that move, the robot in physics, judged by the referee
 with the measured motion. Either two cameras of 320 x 240 pixels see them (drawn by the kernel's renderer, 30 frames a
-second, 30 ms late, the same errors), or an ideal sensor. A task or run that was not planned or not started, for
+second, 30 ms late, the same errors), or an ideal sensor does, or, to tell what the delay does from what the errors do, one without
+errors that is as late and as slow as the cameras. A task or run that was not planned or not started, for
 whatever reason, failed.
 
 Differences of the failure ratio are paired, with intervals of Agresti and Min (2005). Settings were chosen on other
@@ -53,10 +54,12 @@ DEPENDS = (
 FOLDER = RUNS / "perception_end_to_end"
 PARTS = TASKS, WORLDS = "tasks", "worlds"
 TOLD, SEEN = WAYS = "told", "seen"
+LATE = "late"  # told at the cameras' rate and after their latency, in worlds
 PROBLEMS = ("stack_boxes", "handover", "pour", "peg_in_hole", "ball_in_cup")
 SEED = 10_001  # of the first task
 TIMEOUT, RUN_TIMEOUT = 20.0, 10.0  # of a plan, and of a run in a world [s]
 IDEAL = Sensor(rate=100.0, age=0.0, noise=0.0, dropout=0.0)
+DELAYED = Sensor(rate=Cameras().rate, age=Cameras().latency, noise=0.0, dropout=0.0)
 HEAD = ("what", "pairs", "failed told %", "failed seen %", "only told", "only seen", "difference % (95 %)")
 
 
@@ -98,10 +101,10 @@ def _stored(one: TaskRun) -> dict[str, Any]:
 
 
 def went(name: str) -> dict[str, Any]:
-    """Return both runs in a world."""
+    """Return the runs in a world."""
+    sensors = {TOLD: IDEAL, LATE: DELAYED, SEEN: Cameras(rendered=True, seed=worlds_seed(name))}
     found = {}
-    for way in WAYS:
-        sensor = IDEAL if way == TOLD else Cameras(rendered=True, seed=worlds_seed(name))
+    for way, sensor in sensors.items():
         started, environment = time.process_time(), worlds.load(name)
         one = run(environment, driver="mujoco", sensor=sensor, settings=LoopSettings(timeout=RUN_TIMEOUT))
         kept = ("time_to_goal", "clearance", "broken_steps", "stops", "doubted_places")
@@ -132,16 +135,16 @@ def stored(part: str, names: Sequence[str], *, report: bool) -> dict[str, dict[s
     return found
 
 
-def row(label: str, pairs: Sequence[dict[str, Any]]) -> list[Any]:
+def row(label: str, pairs: Sequence[dict[str, Any]], told: str = TOLD) -> list[Any]:
     """Return the row of some pairs."""
     count = len(pairs)
     cells = []
-    for way in WAYS:
+    for way in (told, SEEN):
         bad = sum(one[way]["failed"] for one in pairs)
         low, high = share_interval(bad, count)
         cells.append(f"{100 * bad / count:.1f} ({100 * low:.1f} to {100 * high:.1f})")
-    fewer = sum(one[TOLD]["failed"] and not one[SEEN]["failed"] for one in pairs)
-    more = sum(one[SEEN]["failed"] and not one[TOLD]["failed"] for one in pairs)
+    fewer = sum(one[told]["failed"] and not one[SEEN]["failed"] for one in pairs)
+    more = sum(one[SEEN]["failed"] and not one[told]["failed"] for one in pairs)
     middle, half = agresti_min(fewer, more, count)
     shown = f"{100 * (more - fewer) / count:+.1f} ({100 * (middle - half):+.1f} to {100 * (middle + half):+.1f})"
     return [label, count, *cells, fewer, more, shown]
@@ -164,10 +167,11 @@ def tables(found: dict[str, dict[str, dict[str, Any]]]) -> tuple[list[list[Any]]
         labels = dict.fromkeys(label_of(part, name) for name in pairs)
         rows += [row(label, [one for name, one in pairs.items() if label_of(part, name) == label]) for label in labels]
         rows.append(row(f"all {part}", list(pairs.values())))
-        for way in WAYS:
-            counted = Counter(
-                (label_of(part, name), cause(one[way])) for name, one in pairs.items() if one[way]["failed"]
-            )
+        late = [one for one in pairs.values() if LATE in one]
+        rows += [row(f"all {part}, told as late as the cameras", late, LATE)] if late else []
+        for way in (*WAYS, LATE):
+            failed = [(name, one[way]) for name, one in pairs.items() if way in one and one[way]["failed"]]
+            counted = Counter((label_of(part, name), cause(one)) for name, one in failed)
             causes += [[way, *key, number] for key, number in counted.most_common()]
     every = [one for pairs in found.values() for one in pairs.values()]
     rows += [row("all", every)] if every else []
