@@ -31,7 +31,7 @@ from apex_ompl import plan, problems
 from apex_ompl.collision.mass import per_mass
 from apex_ompl.collision.shapes import coal_geometry, is_shell
 from apex_ompl.drivers import Twin, TwinSettings
-from apex_ompl.drivers.twin import with_mass
+from apex_ompl.drivers.twin_settings import with_mass
 from apex_ompl.errors import SceneError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.problems.suite_robot import robot

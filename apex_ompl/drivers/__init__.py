@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from apex_ompl.drivers.mujoco import MujocoDriver as MujocoDriver
     from apex_ompl.drivers.ros2 import Ros2Driver as Ros2Driver
     from apex_ompl.drivers.twin import Twin as Twin
-    from apex_ompl.drivers.twin import TwinSettings as TwinSettings
+    from apex_ompl.drivers.twin_settings import TwinSettings as TwinSettings
 
 __all__, __getattr__, __dir__ = lazy_names(
     __name__,
@@ -34,6 +34,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "kinematic": "KinematicDriver",
         "mujoco": "MujocoDriver",
         "ros2": "Ros2Driver",
-        "twin": "Twin TwinSettings",
+        "twin": "Twin",
+        "twin_settings": "TwinSettings",
     },  # fmt: skip
 )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.drivers.mujoco import MujocoDriver
-from apex_ompl.drivers.twin import TwinSettings
+from apex_ompl.drivers.twin_settings import TwinSettings
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array

@@ -17,7 +17,8 @@ from numpy.typing import ArrayLike
 from apex_ompl.drivers.commands import START_TOLERANCE, Commands
 from apex_ompl.drivers.driver import DriverState
 from apex_ompl.drivers.guard import Guard
-from apex_ompl.drivers.twin import Twin, TwinSettings, held_loads
+from apex_ompl.drivers.twin import Twin
+from apex_ompl.drivers.twin_settings import TwinSettings, held_loads
 from apex_ompl.errors import MissingFileError, ParameterError
 from apex_ompl.robot.dynamics import Dynamics
 from apex_ompl.robot.model import Robot

@@ -10,11 +10,9 @@ from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.moving import LimitArrays, StopSeries, first_unproved_stop, stop_joints, stop_on_path
 from apex_ompl.moving.dynamic_obstacles import SHORTEST, DynamicObstacles, curve_of
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing.trajectory import Trajectory
+from apex_ompl.timing.trajectory import STOP_DEVIATION, Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import fields_line
-
-DEVIATION = 1e-3  # largest distance of a stop from the path [rad]
 
 
 class Stop(NamedTuple):
@@ -61,7 +59,7 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
     return Stop(Trajectory.unchecked(times, knots, joint_names), beyond, np.inf)
 
 
-def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float = DEVIATION) -> Stop:
+def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float = STOP_DEVIATION) -> Stop:
     """Return the soonest stop along the path of a motion, among profiles of slowing down.
 
     It starts with the state of the motion at ``time``, exactly, keeps the limits of velocity, acceleration and jerk,
@@ -105,7 +103,7 @@ def stops_proved(
     """
     series = StopSeries(
         expected.arrays, expected.with_margin(*growth).packed, age, curve_of(motion),
-        np.stack([motion.positions, motion.velocities, motion.accelerations]), LimitArrays.of(limits), DEVIATION,
+        np.stack([motion.positions, motion.velocities, motion.accelerations]), LimitArrays.of(limits), STOP_DEVIATION,
         moments, period, clock, SHORTEST,
     )  # fmt: skip
     return first_unproved_stop(kernel, series)

@@ -14,7 +14,7 @@ import numpy as np
 
 from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, in_link, turned
 from apex_ompl.drivers.mujoco import MujocoDriver
-from apex_ompl.drivers.twin import TwinSettings
+from apex_ompl.drivers.twin_settings import TwinSettings
 from apex_ompl.drivers.vessels import filled
 from apex_ompl.physics.judges import Check, Intended, Judge
 from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl.drivers.grasps import GRASPING
-from apex_ompl.drivers.twin import TwinSettings
+from apex_ompl.drivers.twin_settings import TwinSettings
 from apex_ompl.drivers.vessels import filled
 from apex_ompl.errors import ParameterError
 from apex_ompl.physics.execution import Executor, motion_of, rehearsed

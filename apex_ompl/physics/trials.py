@@ -13,7 +13,7 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.drivers.twin import with_mass
+from apex_ompl.drivers.twin_settings import with_mass
 from apex_ompl.drivers.vessels import liquid
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject

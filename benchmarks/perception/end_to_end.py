@@ -8,9 +8,9 @@ off by the spreads of a calibration), with looks from other states where somethi
 told as they are. Tasks are judged by where the objects are at the end (:mod:`apex_ompl.physics.judges`), and fail where
 anything touched the cube. **Worlds**: the loop among obstacles that move, the robot in physics, judged by the referee
 with the measured motion. Either two cameras of 320 x 240 pixels see them (drawn by the kernel's renderer, 30 frames a
-second, 30 ms late, the same errors), or an ideal sensor does, or, to tell what the delay does from what the errors do, one without
-errors that is as late and as slow as the cameras. A task or run that was not planned or not started, for
-whatever reason, failed.
+second, 30 ms late, the same errors), or an ideal sensor does. To tell what the delay does from what the errors do, each
+world is run once more with a sensor without errors that is as late and as slow as the cameras. A task or run that was
+not planned or not started, for whatever reason, failed.
 
 Differences of the failure ratio are paired, with intervals of Agresti and Min (2005). Settings were chosen on other
 seeds (tasks 1 to 20, worlds of the split ``validation``). Plans stop by the wall clock: a busy machine finds fewer.

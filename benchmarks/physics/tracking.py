@@ -20,7 +20,7 @@ from tqdm import tqdm
 from apex_ompl import plan, problems
 from apex_ompl.drivers import Guard, MujocoDriver
 from apex_ompl.drivers.library import mujoco
-from apex_ompl.drivers.twin import with_mass
+from apex_ompl.drivers.twin_settings import with_mass
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Timing, Trajectory

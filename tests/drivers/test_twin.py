@@ -18,7 +18,7 @@ from support import STEP, states_around_home
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.drivers import Twin, TwinSettings
 from apex_ompl.drivers.geoms import MOST_GEOMS
-from apex_ompl.drivers.twin import PAYLOAD_RADIUS, mimic_joints, servo_gains
+from apex_ompl.drivers.twin_settings import PAYLOAD_RADIUS, mimic_joints, servo_gains
 from apex_ompl.errors import MissingFileError, ParameterError, RobotError, SceneError, UnknownNameError
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.dynamics import Dynamics

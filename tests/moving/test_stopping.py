@@ -7,10 +7,11 @@ import pytest
 import ruckig
 from timings import LIMITS, NAMES
 
-from apex_ompl.moving.stopping import DEVIATION, stop, stop_along
+from apex_ompl.moving.stopping import stop, stop_along
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.trajectory import STOP_DEVIATION
 
 WIDE = 100.0  # rad, by which position limits are moved out of the way
 SAMPLES = 400
@@ -138,7 +139,7 @@ def test_stops_along_a_path(robot: Robot, timing: Timing) -> None:
                 np.testing.assert_allclose(made(0.0, order), motion(time, order), rtol=0.0, atol=1e-9)
             assert not made.velocities[-1].any() and not made.accelerations[-1].any()
             assert max(made.use(limits).values()) <= 1.0 + 1e-8
-            assert found.within_limits and found.deviation <= DEVIATION
+            assert found.within_limits and found.deviation <= STOP_DEVIATION
             assert made.duration <= motion.duration - time + 1e-9
             sooner += made.duration < motion.duration - time - 1e-6
             points = made(np.linspace(0.0, made.duration, 60))
