@@ -158,7 +158,7 @@ def test_the_page_in_docs_is_that_of_the_results() -> None:
 
 
 @pytest.fixture
-def args(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Namespace:
+def args(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_process: None) -> Namespace:
     """Arguments of the script, with folders of their own and few rows and levels."""
     monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "reproduce.py"), "failure"])
     few = {f"{task}/{size}": SIZES.get(size, 0.0) for task in rows.TASKS for size in ("free", "small")}
