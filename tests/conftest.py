@@ -8,6 +8,7 @@ import runpy
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from support import DATA, ROOT
 from apex_ompl import plan
 from apex_ompl.cli import main
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.evaluation import Workers
 from apex_ompl.ompl.process import quiet_ompl
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.problems.suite_robot import robot as suite_robot
@@ -115,6 +117,21 @@ def apex_process():
         return subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
 
     return run
+
+
+@pytest.fixture(scope="session")
+def _process_of_runs() -> Iterator[ProcessPoolExecutor]:
+    pool = Workers()._pool((), 1)
+    ended = pool.shutdown
+    pool.shutdown = lambda *_, **__: None  # type: ignore[method-assign]
+    yield pool
+    ended()
+
+
+@pytest.fixture
+def shared_process(_process_of_runs: ProcessPoolExecutor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of a benchmark are made in one process for many tests, which saves them its start and its warm-up."""
+    monkeypatch.setattr(Workers, "_pool", lambda *_: _process_of_runs)
 
 
 @pytest.fixture(scope="session")

@@ -52,18 +52,17 @@ def exact_requests(data: pin.GeometryData) -> pin.GeometryData:
     Without contacts requested, GJK stops early and misses overlaps of 0.04 mm. With a cached initial guess, the result
     at the border of contact depends on the states checked before.
     """
-    for request in data.collisionRequests:
-        _make_exact(request)
+    _make_exact(data.collisionRequests)
     return data
 
 
-def _make_exact(request: coal.CollisionRequest) -> coal.CollisionRequest:
+def _make_exact(requests: Iterable[coal.CollisionRequest]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the deprecated flag overrides its successor
-        request.enable_contact = True
-        request.enable_cached_gjk_guess = False
-        request.gjk_initial_guess = coal.GJKInitialGuess.DefaultGuess
-    return request
+        for request in requests:
+            request.enable_contact = True
+            request.enable_cached_gjk_guess = False
+            request.gjk_initial_guess = coal.GJKInitialGuess.DefaultGuess
 
 
 _links: WeakKeyDictionary[Robot, list[coal.CollisionGeometry]] = WeakKeyDictionary()
@@ -96,19 +95,22 @@ class MeshStage:
         self.touch: dict[str, frozenset[str]] = {}
         self.allowed: frozenset[frozenset[str]] = frozenset()
         self._pair_up()
-        self._request = _make_exact(coal.CollisionRequest())
+        self._request = coal.CollisionRequest()
+        _make_exact([self._request])
         self._next = self.links
         self._containment: dict[Pair, list[ContainmentTest]] = {}
         self.lock = ProcessLock()
 
     def allow(self, allowed: Iterable[frozenset[str]]) -> None:
         """Let pairs of bodies touch, by their names, besides the robot's own pairs, and no others."""
-        self.allowed = frozenset(allowed)
-        self.geometry.removeAllCollisionPairs()
-        for pair in self._robot.geometry.collisionPairs:
-            if not self._may_touch(pair.first, pair.second):
-                self.geometry.addCollisionPair(pair)
-        self._pair_up()
+        links = {solid.name for number, solid in self.solids.items() if number < self.links}
+        before, self.allowed = self.allowed, frozenset(allowed)
+        if any(pair <= links for pair in before ^ self.allowed):
+            self.geometry.removeAllCollisionPairs()
+            for pair in self._robot.geometry.collisionPairs:
+                if not self._may_touch(pair.first, pair.second):
+                    self.geometry.addCollisionPair(pair)
+            self._pair_up()
 
     def _pair_up(self) -> None:
         """Make Pinocchio's data for the pairs of links."""

@@ -44,7 +44,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.training.store import load
 from apex_ompl.types import Array, Flags
 
-SMALL = ["--states", "6000", "--nodes", "1500", "--epochs", "80", "--seed", "1"]
+SMALL = ["--states", "4000", "--nodes", "1200", "--epochs", "60", "--seed", "1"]
 SHIPPED = ("damon-2", "damon-4", "damon-8")
 
 
@@ -176,7 +176,7 @@ def test_reconstruction_is_better_in_more_dimensions(models: Path) -> None:
     few, many = (load_manifold(str(models / f"damon-{dim}")) for dim in (2, 8))
     joints = np.array([data.about["joints"].index(name) for name in few.config.joints])
     assert len(joints) == 14, "hands are no part of it"
-    sample, held_out = split_sample(sample_states(data, joints, 6000, 16, seed=1))
+    sample, held_out = split_sample(sample_states(data, joints, 4000, 16, seed=1))
     assert not set(sample.paths) & set(held_out.paths) and len(held_out.states) >= 64
 
     def error(rebuilt: Array) -> float:

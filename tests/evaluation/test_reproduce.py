@@ -158,7 +158,7 @@ def test_the_page_in_docs_is_that_of_the_results() -> None:
 
 
 @pytest.fixture
-def args(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Namespace:
+def args(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_process: None) -> Namespace:
     """Arguments of the script, with folders of their own and few rows and levels."""
     monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "reproduce.py"), "failure"])
     few = {f"{task}/{size}": SIZES.get(size, 0.0) for task in rows.TASKS for size in ("free", "small")}
@@ -201,24 +201,26 @@ def test_dynamic_figures_are_made_and_examples_take_their_runs(
     args: Namespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     blind = rows.in_loop("blind", "blind")
-    levels = {f"vertical/moving-{size}-0.4": size for size in SIZES} | {"horizontal/moving-large-0.4": "large"}
+    sizes = {size: SIZES[size] for size in ("medium", "large")}
+    levels = {f"vertical/moving-{size}-0.4": size for size in sizes} | {"horizontal/moving-large-0.4": "large"}
     monkeypatch.setattr(moving, "MOVING", levels)
+    monkeypatch.setattr(moving, "SIZES", sizes)
     monkeypatch.setattr(moving, "METHODS", (blind, rows.in_loop("later", "no_such_method")))
     monkeypatch.setattr(moving, "SWEEPS", ())
     made = moving.dynamic(args)
     made.write("dynamic", args)
     assert {name: cell["N"] for name, cell in made.data["tasks"].items()} == {
-        "vertical, blind": 5, "horizontal, blind": 1, "both, blind": 6,
+        "vertical, blind": 2, "horizontal, blind": 1, "both, blind": 3,
     }  # fmt: skip
     runs = [json.loads(line) for line in (args.keep / "paper_loops" / "runs.jsonl").read_text().splitlines()]
     failed = [run for run in runs if not run["solved"]]
     both = made.data["tasks"]["both, blind"]
-    assert both["R_f"] == pytest.approx(100 * len(failed) / 6) and sum(both["causes"].values()) == len(failed) > 0
+    assert both["R_f"] == pytest.approx(100 * len(failed) / 3) and sum(both["causes"].values()) == len(failed) > 0
     outcome = Outcome(failed[0]["outcome"])
     monkeypatch.setattr(examples, "KINDS", {"one": examples.Kind((outcome,), ("blind",)),
                                             "none": examples.Kind((Outcome.LIMITS,), ("blind",))})  # fmt: skip
     drawn = examples.failures(args)
-    assert len((args.keep / "paper_loops" / "runs.jsonl").read_text().splitlines()) == 6, "no run is made again"
+    assert len((args.keep / "paper_loops" / "runs.jsonl").read_text().splitlines()) == 3, "no run is made again"
     picked = examples.first_failure(runs, examples.KINDS["one"])
     assert drawn.data["one"]["world"] == picked["problem"] and drawn.data["none"] is None
     assert drawn.data["one"]["reason"] == picked["reason"], "the same run, bit for bit"

@@ -64,7 +64,7 @@ def test_retiming_alone_keeps_to_the_path_without_a_stop_first() -> None:
 
 
 def test_the_papers_loop_stops_at_its_distance_and_follows_what_is_not_proved() -> None:
-    settings = LoopSettings(trigger=0.1, timeout=2.5, latency=0.0)
+    settings = LoopSettings(trigger=0.1, timeout=1.8, latency=0.0)
     found = run("vertical/moving-small-0.1/800000", "apex-paper", settings=settings)
     stops = events(found, "stop")
     assert stops and found.metrics["replans_accepted"] >= 2.0

@@ -127,7 +127,7 @@ def test_a_robot_that_leaves_is_not_held_by_a_stop_before_it_has_set_out() -> No
     first = next(event for event in found.events if event.kind == "accepted")
     assert first.data["part"] == "evade" and first.data["leaving"] and found.metrics["unguarded_steps"] > 0.0
     assert found.outcome is Outcome.REACHED and found.metrics["clearance"] > 0.0
-    proved = run(name, "no-network", seed=0)
+    proved = run(name, "no-network", seed=0, settings=LoopSettings(timeout=1.0))
     assert proved.outcome is Outcome.HIT_AT_REST and proved.metrics["unguarded_steps"] == 0.0
 
 

@@ -54,8 +54,10 @@ class BadEyes:
         return found[::-1]
 
 
-def go(*faults: str, eyes: type[BadEyes] | None = None) -> tuple[RunRecord, RefereeReport, PlannerProcess]:
-    context = context_of(PROBLEM, speed=0.3, prediction="still", fastest=0.5, timeout=3.0)
+def go(
+    *faults: str, eyes: type[BadEyes] | None = None, timeout: float = 3.0
+) -> tuple[RunRecord, RefereeReport, PlannerProcess]:
+    context = context_of(PROBLEM, speed=0.3, prediction="still", fastest=0.5, timeout=timeout)
     world = world_of(PROBLEM, crossing(setup_of(PROBLEM)))
     work = Work(world.problem.still, context.limits, context.stopping, context.settings, Faulty, faults, 0)
     seen = SensorStream(Sensor(), world, context.settings.watched) if eyes is None else eyes(world)
@@ -93,13 +95,13 @@ def test_a_killed_planner_whose_child_lives_on_is_replaced(monkeypatch: pytest.M
 
 
 def test_a_planner_that_never_answers_ends_defined() -> None:
-    done, report, process = go("never")
+    done, report, process = go("never", timeout=1.5)
     check_defined(done, report, process)
     assert "no answer came in time" in {event.data["why"] for event in done.events if event.kind == "rejected"}
 
 
 def test_observations_may_be_late_doubled_out_of_order_or_no_numbers() -> None:
-    check_defined(*go(eyes=BadEyes))
+    check_defined(*go(eyes=BadEyes, timeout=2.0))
 
 
 @pytest.mark.parametrize("where", ["advance", "step", "announce_start"])

@@ -56,7 +56,7 @@ def test_a_motion_is_free_up_to_the_first_moment_that_is_not_proved(
     dynamic_obstacle = dynamic_obstacle_near(robot, motion, rng)
     conflict = prove_motion(bare.kernel, DynamicObstacles([dynamic_obstacle]), motion)
     exact = CollisionChecker(robot, [dynamic_obstacle], proofs=False)
-    for time in np.linspace(0.0, motion.duration, 120):
+    for time in np.linspace(0.0, motion.duration, 60):
         exact.move("dynamic_obstacle", obstacle_at(dynamic_obstacle, time).position)
         order = robot.to_pinocchio(motion(time))
         if time < conflict.time:

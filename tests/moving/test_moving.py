@@ -40,7 +40,7 @@ def test_valid_paths_are_free_at_all_times_and_invalid_ones_nearly_touch(robot: 
     check = check_timed_path(robot, problem_with(robot, dynamic_obstacle), path, times)
     checker = CollisionChecker(robot, [dynamic_obstacle], proofs=False)
     nearest = np.inf
-    for time in np.linspace(0.0, times[-1], 150):
+    for time in np.linspace(0.0, times[-1], 80):
         q = np.array([np.interp(time, times, column) for column in path.T])
         checker.move("dynamic_obstacle", obstacle_at(dynamic_obstacle, time).position)
         if check:

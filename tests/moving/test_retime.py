@@ -91,7 +91,7 @@ def earliest(blocks: Blocked, start: Blocked, end: Blocked, clock: float, most: 
 def test_random_crossings(kernel: Kernel, robot: Robot, speed: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     ratios, found, possible, open_ones = [], 0, 0, 0
-    while possible < 8:
+    while possible < 5:
         motion = arm_motion(robot, rng, speed)
         dynamic = crossing(kernel, motion, rng)
         time = float(rng.choice([0.0, 0.1]) * motion.duration)
@@ -115,7 +115,7 @@ def test_random_crossings(kernel: Kernel, robot: Robot, speed: float, seed: int)
         if made.trajectory is not None:
             found += 1
             ratios.append(made.trajectory.duration / max(least, motion.duration - time))
-    assert found >= 6 and open_ones == 0  # the grid knows no accelerations: some of its ways there are not
+    assert found >= 4 and open_ones == 0  # the grid knows no accelerations: some of its ways there are not
     assert np.median(ratios) <= 1.15
     if speed == 1.0:  # else it may hurry, and the grid may not
         assert min(ratios) >= 0.98

@@ -166,6 +166,7 @@ def test_what_does_not_go_with_dynamic_obstacles_is_named(problem: Problem, robo
     assert blocked.status is PlanStatus.INVALID_START and "ball" in blocked.reason and "at 0" in blocked.reason
 
 
+@pytest.mark.usefixtures("shared_process")
 def test_the_benchmark_runs_levels_with_moving_obstacles(tmp_path: Path) -> None:
     out = tmp_path / "runs"
     bench(["vertical/moving-medium-0.2"], [Row("rrtconnect", "rrtconnect")], runs=1, timeout=20.0, out=out)

@@ -106,7 +106,7 @@ def test_a_contact_at_the_start_is_refused_with_the_remedy_or_left() -> None:
     out = [kept.check(q).clearance for q in np.linspace(path[0], path[1], 200)]  # finer than what was looked at
     assert (np.diff(out) > -1e-6).all() and out[0] == pytest.approx(-DEPTH, abs=1e-5) and out[-1] > 5e-5
     assert all(map(kept.check, path[1:]))
-    seen = [kept.check(q).clearance for q in motion(np.arange(0.0, motion.duration, 0.004))]
+    seen = [kept.check(q).clearance for q in motion(np.arange(0.0, motion.duration, 0.01))]
     free = int(np.argmax(np.array(seen) > 1e-5))
     assert (np.diff(seen[: free + 1]) > -1e-6).all() and min(seen[free:]) > 0.0
     assert kept.plan(home, goal, leave_contact=1e-3, timing=False).path is not None

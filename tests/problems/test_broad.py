@@ -75,7 +75,7 @@ def test_unseen_problems_are_refused_for_training() -> None:
 
 @pytest.mark.parametrize(("suite", "level"), LEVELS)
 def test_every_grammar_gives_parts_and_places_for_any_random_numbers(suite: str, level: str) -> None:
-    for seed in range(24):
+    for seed in range(12):
         rng = np.random.default_rng([5, seed])
         one = GRAMMARS[suite][level](rng)
         placed = one.placed(site(rng, one))
@@ -96,7 +96,7 @@ def test_drawn_problems_keep_a_centimetre_at_both_ends(robot: Robot, suite: str,
     """By the distances of the exact shapes; aligned objects may touch each other at the goal."""
     name = name_of(suite, level, 3)
     problem = problems.load(name)
-    assert problems.load(name) == problem and problem.name == name
+    assert problem.name == name
     ends = np.stack([problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)[0]])
     primitives = problems.primitives(problem)
     assert 0 < len(primitives) <= 300
@@ -115,7 +115,7 @@ def test_drawn_problems_keep_a_centimetre_at_both_ends(robot: Robot, suite: str,
 
 
 def test_another_process_draws_the_same() -> None:
-    names = [name_of(*pair, 4) for pair in LEVELS[::8]]
+    names = [name_of(*pair, 4) for pair in LEVELS[::4]]
     code = "import sys; from apex_ompl import problems; from apex_ompl.problems.frozen import digest\n"
     code += "print([digest(problems.load(name)) for name in sys.argv[1:]])"
     done = subprocess.run([sys.executable, "-c", code, *names[::-1]], capture_output=True, text=True, check=True)
@@ -180,13 +180,13 @@ def test_obstacles_of_a_problem_as_primitives_are_not_drawn_again(monkeypatch: p
 
 def test_held_objects_are_of_all_kinds_and_free_of_the_fingers(robot: Robot) -> None:
     seen, hands = set(), []
-    for seed in range(60):
+    for seed in range(40):
         held = draw_held(np.random.default_rng([2, seed]))
         hands.append(len({body.link for body in held.attached}))
         seen |= {kind for kind in KINDS for body in held.attached if kind in body.name}
         assert (held.low <= held.high).all() and held.tables.both.dof == robot.dof
     assert seen == set(KINDS)
-    assert 0.3 < hands.count(0) / 60 < 0.65 and hands.count(1) > 5 and hands.count(2) > 5
+    assert 0.3 < hands.count(0) / 40 < 0.65 and hands.count(1) > 4 and hands.count(2) > 4
 
 
 def test_broad_units_have_a_strategy_of_their_own() -> None:

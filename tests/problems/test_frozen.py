@@ -52,21 +52,21 @@ def test_the_first_problems_of_validation_and_test_are_frozen(robot: Robot, suit
     names = [problems.frozen_names(suite, level, split) for split in ("test", "validation")]
     for first, count, some in zip((900_000, 800_000), counts, names, strict=True):
         assert some == tuple(f"{suite}/{level}/{first + k}" for k in range(count))
-    digests = set()
-    for name in (*names[0], *names[1]):
+    digests, some = set(), [name for split in names for name in split[::5]]  # the files are those of their hashes
+    for name in some:
         problem, witness = problems.load(name), problems.witness(name)
         digests.add(frozen.digest(problem.model_copy(update={"name": "any"})))
         assert problem.name == name and bool(problem.moving) == level.startswith("moving-")
         assert np.array_equal(witness.path[0], problem.start_state(robot.joint_names))
         assert np.array_equal(witness.path[-1], problem.goal_states(robot.joint_names)[0])
         assert (witness.times is not None) == bool(problem.moving)
-    assert len(digests) == sum(counts)
+    assert len(digests) == len(some)
 
 
 @pytest.mark.parametrize(("suite", "level"), STATIC)
 def test_witnesses_pass_the_full_check(robot: Robot, suite: str, level: str) -> None:
     """Some of each level; scripts/check_frozen.py checks all."""
-    for name in problems.frozen_names(suite, level)[::20]:
+    for name in problems.frozen_names(suite, level)[::34]:
         problem, witness = problems.load(name), problems.witness(name)
         checker = CollisionChecker(robot, problem.scene, problem.attached)
         check = full_check(checker, witness.path, witness.path[0], problem.goal_states(robot.joint_names))
@@ -79,7 +79,7 @@ def test_witnesses_pass_the_full_check(robot: Robot, suite: str, level: str) -> 
 
 @pytest.mark.parametrize(("suite", "level"), MOVING)
 def test_timed_witnesses_pass_their_check(robot: Robot, suite: str, level: str) -> None:
-    for name in problems.frozen_names(suite, level)[3::16]:
+    for name in problems.frozen_names(suite, level)[3::33]:
         witness = problems.witness(name)
         check = check_timed_path(robot, problems.load(name), witness.path, witness.times)
         assert check, check.reason

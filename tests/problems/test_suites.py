@@ -55,7 +55,7 @@ def test_the_suites_and_levels_are_those_of_the_contract() -> None:
         assert set(suites[suite]) == {"free", *alignment.SIZES, "extreme"} | moving and len(moving) == 15
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(which=st.sampled_from(SUITE_LEVELS), seed=st.integers(0, 799_999), other=st.integers(0, 799_999))
 def test_the_same_seed_gives_the_same_problem(which: tuple[str, str], seed: int, other: int) -> None:
     suite, level = which
@@ -78,7 +78,7 @@ def test_another_process_draws_the_same() -> None:
 @pytest.mark.parametrize(("suite", "level"), HARD_LEVELS)
 def test_every_scene_can_be_built(suite: str, level: str) -> None:
     """For any random numbers: every body has a positive thickness, and names are unique."""
-    for seed in range(150):
+    for seed in range(60):
         task = scenes.SUITES[suite](np.random.default_rng([9, seed]), level)
         assert len({body.name for body in task.scene}) == len(task.scene)
         for region in (*task.start, *task.goal):
@@ -90,7 +90,7 @@ def test_starts_and_goals_of_the_hard_suites_have_a_clearance_of_a_centimeter(
     robot: Robot, suite: str, level: str
 ) -> None:
     """By Coal's distances, the links against each other included; the hands hold nothing."""
-    for seed in range(2):
+    for seed in range(1 + (level == "easy")):
         problem = problems.sample(suite, level=level, seed=seed)
         checker = CollisionChecker(robot, problem.scene, proofs=False)
         for q in ends(problem, robot):
@@ -103,8 +103,8 @@ def test_starts_and_goals_of_the_hard_suites_have_a_clearance_of_a_centimeter(
 @pytest.mark.parametrize("level", [*LEVELS, "extreme"])
 @pytest.mark.parametrize("suite", ["vertical", "horizontal"])
 def test_alignment_problems_satisfy_the_definition_of_the_paper(robot: Robot, suite: str, level: str) -> None:
-    held = set()
-    for seed in range(8):
+    held, free = set(), level == "free"
+    for seed in range(8 if free else 3):
         problem = problems.sample(suite, level=level, seed=seed)
         start, goal = ends(problem, robot)
         names = tuple(body.name for body in problem.attached)
@@ -121,7 +121,7 @@ def test_alignment_problems_satisfy_the_definition_of_the_paper(robot: Robot, su
             corners = box_corners(robot, problem, start)
             assert min(c[:, 2].min() for c in corners) >= 0.08
             assert np.linalg.norm(corners[0].mean(axis=0) - corners[1].mean(axis=0)) >= 0.4
-    assert held == set(FACES[suite])
+    assert not free or held == set(FACES[suite])
 
 
 @pytest.mark.parametrize("level", LEVELS[1:])
@@ -129,7 +129,7 @@ def test_cubes_have_their_size_and_speed_and_are_clear_of_start_and_goal(robot: 
     moving, _, rest = level.rpartition("moving-")
     size, _, speed = rest.partition("-")
     counts = set()
-    for seed in range(12):
+    for seed in range(3 if speed else 12):
         problem = problems.sample("vertical", level=level, seed=seed)
         start, goal = ends(problem, robot)
         duration = float(np.max(np.abs(goal - start) / robot.limits.velocity)) / 0.25

@@ -32,7 +32,7 @@ sizes, suites, paces = (
     st.sampled_from(["vertical", "horizontal"]),
     st.sampled_from([0.25, 1.0]),
 )
-several = settings(max_examples=12)
+several = settings(max_examples=8)
 
 
 @cache

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -64,10 +65,17 @@ def package(path: Path) -> str:
     return path.relative_to(ROOT / "apex_ompl").parts[0].removesuffix(".py")
 
 
+@cache
+def statements(path: Path) -> tuple[ast.Import | ast.ImportFrom, ...]:
+    """The import statements of a module, at the top or inside functions."""
+    nodes = ast.walk(ast.parse(path.read_text()))
+    return tuple(node for node in nodes if isinstance(node, ast.Import | ast.ImportFrom))
+
+
 def imports(path: Path) -> set[str]:
     """Packages of apex_ompl that a module imports, at the top or inside functions."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in statements(path):
         if isinstance(node, ast.ImportFrom) and node.module:
             if node.module == "apex_ompl":
                 found |= {alias.name for alias in node.names if alias.name in HEIGHT}
@@ -80,7 +88,7 @@ def imports(path: Path) -> set[str]:
 
 def outside(path: Path) -> set[str]:
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in statements(path):
         if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
             found.add(node.module.split(".")[0])
         elif isinstance(node, ast.Import):
@@ -114,7 +122,7 @@ def test_low_packages_know_no_ompl() -> None:
 def modules(path: Path) -> set[str]:
     """Modules that a file imports, at the top or inside functions, by their full names."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in statements(path):
         if isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         elif isinstance(node, ast.Import):
