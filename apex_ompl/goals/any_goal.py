@@ -7,6 +7,7 @@ region is a goal of this kind as well: poses that are drawn in the region.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -81,6 +82,34 @@ class AnyGoal:
             errors, bounds = goal.errors(q), goal.bounds
             least = 0.0 if within(errors, bounds) else min(least, single.relative_error(errors, bounds))
         return {ANY: least}
+
+    def nearest_states(self, checker: CollisionChecker, rng: np.random.Generator, count: int) -> Array:
+        """Return free states that reach goals, by a few descents for each: the nearest of each goal in turn.
+
+        Args:
+            checker: Checks the states for collision.
+            rng: Source of random numbers.
+            count: Most states.
+
+        Returns:
+            Shape (N, dof).
+        """
+        states = self._first(checker, rng).states
+        return states[self.in_turn(states)[:count]]
+
+    def in_turn(self, states: Array) -> list[int]:
+        """Return the rows of states, shape (N, dof): of each goal the nearest in time, then the second ones, and so on."""
+        order = np.argsort(self._durations(states), kind="stable") if len(states) else []
+        ranked, seen = list[tuple[int, int]](), Counter[int]()
+        for k, row in enumerate(order):
+            member = self._member(states[row])
+            ranked.append((seen[member], k))
+            seen[member] += 1
+        return [int(order[k]) for _, k in sorted(ranked)]
+
+    def _member(self, q: Array) -> int:
+        """Return the number of the first goal that a state, shape (dof,), reaches, or -1 of a joint configuration."""
+        return next((k for k, goal in enumerate(self.members) if within(goal.errors(q), goal.bounds)), -1)
 
     def sample(
         self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200

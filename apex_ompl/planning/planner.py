@@ -181,7 +181,7 @@ class MotionPlanner:
         with running(), self._lock:
             with unforked():
                 from apex_ompl.planning.tasks import plan_task
-                from apex_ompl.scene.problem import with_lines
+                from apex_ompl.planning.task_problem import with_lines
 
                 problem = with_lines(problem)
                 self.world.load(problem)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import nan
+from math import isnan, nan
 
 import coal
 import numpy as np
@@ -21,11 +21,24 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.line_query import line_query
 from apex_ompl.planning.lines import plan_along
+from apex_ompl.planning.superposition import abreast, superposed
 from apex_ompl.planning.task_constraints import StepConstraints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep, WaitStep
+from apex_ompl.scene.steps import (
+    AllowStep,
+    AttachStep,
+    DetachStep,
+    GraspStep,
+    HandStep,
+    LineStep,
+    ReleaseStep,
+    RetreatStep,
+    TogetherStep,
+    TurnStep,
+    WaitStep,
+)
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
@@ -162,10 +175,16 @@ class StepPlanner:
             return self._line(world, step, q, self._turned(world, step, q), timing)
         if isinstance(step, RetreatStep):
             return self._retreat(world, step, q, timing)
+        if isinstance(step, TogetherStep):
+            return self._together(world, step, q, timing)
+        if isinstance(step, AttachStep | DetachStep | AllowStep):
+            during = world if isinstance(step, DetachStep) else world.after(step, q)
+            return self._proved(StepPlan(step, during, world.after(step, q), Path(q[None]), None, nan), timing)
         assert not isinstance(step, MoveStep)
         return self._hand(world, step, q, timing)
 
-    def _become(self, world: TaskWorld, pairs: frozenset[tuple[str, str]] | None = None) -> None:
+    def become(self, world: TaskWorld, pairs: frozenset[tuple[str, str]] | None = None) -> None:
+        """Put the bodies of a world into the checker, with other pairs that may touch if they are given."""
         self.checker.become(world.scene, world.held, world.pairs if pairs is None else pairs)
 
     def _poses(self, world: TaskWorld, step: LineStep, q: Array) -> dict[str, Array]:
@@ -252,7 +271,7 @@ class StepPlanner:
         timing: Timing | None,
     ) -> StepPlan:  # fmt: skip
         """Return straight lines from poses of frames to poses, with blends between them."""
-        self._become(world)
+        self.become(world)
         query = line_query(
             self.checker, q, list(poses), frame=None, blend=_blend(poses), speed=step.speed,
             timing=False if timing is None else _timing_in(world, timing), problem=lambda goals: self.problem,
@@ -275,24 +294,66 @@ class StepPlanner:
         self, world: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array, timing: Timing | None
     ) -> StepPlan:
         """Return a hand that opens or closes."""
-        synergy, during = self.robot.hands[step.hand].synergy, world
-        to = step.to
-        if isinstance(step, GraspStep):
-            during = world.grasped(step, q)
-            if to is None and synergy is not None:
-                to = self._closed(during, step, q)
-        end = q.copy()
+        during = world.grasped(step, q) if isinstance(step, GraspStep) else world
+        end = self.hand_end(during, step, q)
+        states = np.stack([q, end]) if (end != q).any() else q[None]
+        return self._proved(StepPlan(step, during, world.after(step, end), Path(states), None, nan), timing)
+
+    def hand_end(self, during: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array) -> Array:
+        """Return the state after a hand has opened or closed, shape (dof,).
+
+        Raises:
+            StepFailed: The open hand is in contact with what it is to hold.
+        """
+        synergy, to, end = self.robot.hands[step.hand].synergy, step.to, q.copy()
+        if isinstance(step, GraspStep) and to is None and synergy is not None:
+            to = self._closed(during, step, q)
         if synergy is not None and to is not None:
             k, limits = self.robot.joint_names.index(synergy), self.robot.limits
             wanted = float(np.clip(to, limits.lower[k] + HAND_ROOM, limits.upper[k] - HAND_ROOM))
             end[k] = q[k] if abs(wanted - q[k]) <= HAND_ROOM else wanted
-        states = np.stack([q, end]) if (end != q).any() else q[None]
-        self._become(during)
-        check = full_check(self.checker, states, q, [end], deadline=self._deadline.at)
+        return end
+
+    def _proved(self, plan: StepPlan, timing: Timing | None) -> StepPlan:
+        """Return a step with its clearance and its motion.
+
+        Raises:
+            StepFailed: It is not free, or not timed in time.
+        """
+        states = plan.path.states
+        self.become(plan.world)
+        check = full_check(self.checker, states, states[0], [states[-1]], deadline=self._deadline.at)
         if not check or check.proof is None:
             raise StepFailed(LATE if check.timed_out else check.reason)
-        found = StepPlan(step, during, world.after(step, end), Path(states), None, check.proof.clearance)
-        return found if timing is None else self._timed(found, timing)
+        plan = replace(plan, clearance=check.proof.clearance)
+        return plan if timing is None else self._timed(plan, timing)
+
+    def _together(self, world: TaskWorld, step: TogetherStep, q: Array, timing: Timing | None) -> StepPlan:
+        """Return steps that start at once, each planned while the others rest, and proved together."""
+        plans = [self.plan(world, one, q, timing) for one in step.steps]
+        columns = [set(np.flatnonzero((plan.path.states != q).any(axis=0)).tolist()) for plan in plans]
+        shared = [k for k in range(len(q)) if sum(k in moved for moved in columns) > 1]
+        if shared:
+            raise StepFailed(f"two of them move {self.robot.joint_names[shared[0]]}")
+        during, after, end = world, world, q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
+        for one in step.steps:
+            during = during.after(one, q) if isinstance(one, GraspStep | AttachStep) else during
+            after = after.after(one, end)
+        motions = [plan.motion for plan in plans if plan.motion is not None]
+        motion = superposed([(one, 0.0) for one in motions]) if len(motions) == len(plans) else None
+        path = Path(abreast([plan.path.states for plan in plans]))
+        self.become(during)
+        check = full_check(self.checker, path.states if motion is None else motion, deadline=self._deadline.at)
+        if not check or check.proof is None:
+            raise StepFailed(LATE if check.timed_out else check.reason)
+        lefts, use = [plan.left for plan in plans if not isnan(plan.left)], dict[str, float]()
+        for plan in plans:
+            use = {name: max(use.get(name, 0.0), share) for name, share in (use | dict(plan.use)).items()}
+        left = nan if not lefts else max(lefts) if motion is not None else float(len(path.states) - 1)
+        return StepPlan(
+            step, during, after, path, motion, check.proof.clearance, left, use,
+            max(plan.deviation for plan in plans),
+        )  # fmt: skip
 
     def _closed(self, during: TaskWorld, step: GraspStep, q: Array) -> float:
         """Return the synergy at which a hand is just before contact with its object.
@@ -341,17 +402,14 @@ class StepPlanner:
 
     def _wait(self, world: TaskWorld, step: WaitStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a rest."""
-        self._become(world)
-        states, motion = q[None], None
-        check = full_check(self.checker, states, q, deadline=self._deadline.at)
-        if not check or check.proof is None:
-            raise StepFailed(LATE if check.timed_out else check.reason)
-        if timing is not None:
-            still = np.zeros((2, len(q)))
-            motion = Trajectory(
-                np.array([0.0, step.seconds]), np.stack([q, q]), still, still.copy(), self.robot.joint_names
-            )
-        return StepPlan(step, world, world, Path(states), motion, check.proof.clearance)
+        found = self._proved(StepPlan(step, world, world, Path(q[None]), None, nan), None)
+        if timing is None:
+            return found
+        still = np.zeros((2, len(q)))
+        motion = Trajectory(
+            np.array([0.0, step.seconds]), np.stack([q, q]), still, still.copy(), self.robot.joint_names
+        )
+        return replace(found, motion=motion)
 
     def _retreat(self, world: TaskWorld, step: RetreatStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a hand's way from what it released, which it may touch on the first part of the way only."""
@@ -364,7 +422,7 @@ class StepPlanner:
         pairs = world.leaving_pairs(step.hand)
         if not pairs:
             return replace(found, left=0.0)
-        self._become(world, world.pairs - pairs)
+        self.become(world, world.pairs - pairs)
         left, clearance = self._left(found, step, world)
         self._check_depths(found, left, pairs)
         return replace(found, left=left, clearance=min(clearance, found.clearance))

@@ -285,7 +285,7 @@ class World:
             held, left = self.held.get(name) if isinstance(name, str) else None, list[Obstacle]()
             if at is not None and held is not None:
                 pose = self.checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
-                shape = given_fields(held, ("link", "links", "touch_links", "contact"))
+                shape = given_fields(held, ("link", "links", "touch_links"))
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
             self.checker.detach(name)
             self._add(left)
