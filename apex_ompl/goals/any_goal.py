@@ -98,7 +98,7 @@ class AnyGoal:
         return states[self.in_turn(states)[:count]]
 
     def in_turn(self, states: Array) -> list[int]:
-        """Return the rows of states, shape (N, dof): of each goal the nearest in time, then the second ones, and so on."""
+        """Return the rows of states, shape (N, dof): the nearest of each goal in time, then the second ones, and so on."""
         order = np.argsort(self._durations(states), kind="stable") if len(states) else []
         ranked, seen = list[tuple[int, int]](), Counter[int]()
         for k, row in enumerate(order):

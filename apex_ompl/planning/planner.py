@@ -180,8 +180,8 @@ class MotionPlanner:
         check_options(options, OPTIONS)
         with running(), self._lock:
             with unforked():
-                from apex_ompl.planning.tasks import plan_task
                 from apex_ompl.planning.task_problem import with_lines
+                from apex_ompl.planning.tasks import plan_task
 
                 problem = with_lines(problem)
                 self.world.load(problem)

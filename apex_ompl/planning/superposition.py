@@ -22,7 +22,7 @@ def superposed(parts: Sequence[tuple[Trajectory, float]]) -> Trajectory:
     """Return the sum of the displacements of motions, each of which rests before it starts and after it ends.
 
     Args:
-        parts: Motions from rest to rest and the times when they start, from 0 [s]; the first one starts where the sum does.
+        parts: Motions from rest to rest and the times when they start [s], the first one at 0.
     """
     first = parts[0][0]
     known = np.sort(np.concatenate([motion.times + start for motion, start in parts]))

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.planning.query import goal_record
 from apex_ompl.robot import Robot
-from apex_ompl.planning.query import goal_record, joint_values
 from apex_ompl.scene.bodies import Vector
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import LineStep, Step

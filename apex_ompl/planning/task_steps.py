@@ -7,22 +7,20 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import isnan, nan
 
-import coal
 import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.constraints.frames import frame_of
 from apex_ompl.constraints.line import SAME_POINT
 from apex_ompl.errors import SceneError, TimingError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
-from apex_ompl.planning.line_query import line_query
+from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
 from apex_ompl.planning.superposition import abreast, superposed
 from apex_ompl.planning.task_constraints import StepConstraints
+from apex_ompl.planning.task_waypoints import StepFailed, held_pose, waypoints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
@@ -45,27 +43,11 @@ from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
 from apex_ompl.util.clocks import Deadline
 
-NEAR = 1e-5  # of a share of a line at which the search for its end stops [m]
-MOST_ADVANCES = 500
-ARC = np.radians(5.0)  # of a turn that a straight line replaces [rad]
 LATE = "the time is over"
 BLEND = 0.4  # of the way between two poses of a turn
 HAND_ROOM = 1e-4  # to the limits of a synergy, which motions at another rate need at rests
 DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
 EXAMINED = 50  # states at which that is examined
-
-
-class StepFailed(Exception):  # noqa: N818 - an outcome, not an error
-    """A step that cannot be done from a state.
-
-    Attributes:
-        cause: The reason without the numbers of this state, by which failures are counted.
-    """
-
-    def __init__(self, reason: str, cause: str = "") -> None:
-        """Give the reason, and the cause if it is another text."""
-        super().__init__(reason)
-        self.cause = cause or reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,12 +151,10 @@ class StepPlanner:
         """
         if isinstance(step, WaitStep):
             return self._wait(world, step, q, timing)
-        if isinstance(step, LineStep):
-            return self._line(world, step, q, [self._poses(world, step, q)], timing)
-        if isinstance(step, TurnStep):
-            return self._line(world, step, q, self._turned(world, step, q), timing)
         if isinstance(step, RetreatStep):
             return self._retreat(world, step, q, timing)
+        if isinstance(step, LineStep | TurnStep):
+            return self._line(world, step, q, timing)
         if isinstance(step, TogetherStep):
             return self._together(world, step, q, timing)
         if isinstance(step, AttachStep | DetachStep | AllowStep):
@@ -187,95 +167,26 @@ class StepPlanner:
         """Put the bodies of a world into the checker, with other pairs that may touch if they are given."""
         self.checker.become(world.scene, world.held, world.pairs if pairs is None else pairs)
 
-    def _poses(self, world: TaskWorld, step: LineStep, q: Array) -> dict[str, Array]:
-        """Return the poses of the frames at the end of a line, shape (4, 4) each."""
-        frames = {name: frame_of(self.robot, name, world.held) for name in step.frame}
-        poses = {name: self.robot.link_pose(q, frame.link) @ frame.pose for name, frame in frames.items()}
-        if step.onto is not None:
-            name = step.frame[0]
-            return {name: self._aligned(world, step, q, poses[name])}
-        assert step.by is not None
-        moves = {
-            name: np.array(step.by) if step.axes == "world" else pose[:3, :3] @ np.array(step.by)
-            for name, pose in poses.items()
-        }
-        share = 1.0 if step.gap is None else self._share(world, moves, step.gap, q)
-        for name, pose in poses.items():
-            pose[:3, 3] += share * moves[name]
-        return poses
-
-    def _aligned(self, world: TaskWorld, step: LineStep, q: Array, pose: Array) -> Array:
-        """Return the pose of a frame in which its contact face is aligned with another one."""
-        assert step.onto is not None and step.distance is not None
-        moved, fixed = world.face(step.frame[0], q), world.face(step.onto, q)
-        assert moved is not None and fixed is not None
-        turn = pin.Quaternion.FromTwoVectors(moved[1], -fixed[1]).matrix()
-        made = np.eye(4)
-        made[:3, :3] = turn @ pose[:3, :3]
-        made[:3, 3] = turn @ (pose[:3, 3] - moved[0]) + fixed[0] + step.distance * fixed[1]
-        return made
-
-    def _turned(self, world: TaskWorld, step: TurnStep, q: Array) -> list[dict[str, Array]]:
-        """Return the poses of frames along a turn about the origin of the first, a few degrees apart."""
-        poses = {}
-        for name in step.frame:
-            frame = frame_of(self.robot, name, world.held)
-            poses[name] = self.robot.link_pose(q, frame.link) @ frame.pose
-        first = poses[step.frame[0]]
-        to = np.asarray(step.to, float) / length(step.to)
-        turn = pin.AngleAxis(pin.Quaternion.FromTwoVectors(first[:3, 2], to))
-        count = max(1, int(np.ceil(turn.angle / ARC))) if len(poses) > 1 else 1  # its own origin needs no arc
-        found = []
-        for k in range(1, count + 1):
-            part = np.eye(4)
-            part[:3, :3] = pin.AngleAxis(turn.angle * k / count, turn.axis).toRotationMatrix()
-            part[:3, 3] = first[:3, 3] - part[:3, :3] @ first[:3, 3]
-            found.append({name: part @ pose for name, pose in poses.items()})
-        return found
-
-    def _share(self, world: TaskWorld, moves: Mapping[str, Array], gap: float, q: Array) -> float:
-        """Return the share of displacements after which a moved object is at a gap from another body, 1 at most.
-
-        Conservative advancement: a body that is d away is not reached before the displacement is that long.
+    def line_query(
+        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
+    ) -> LineQuery:
+        """Return what a step along straight lines is about; the checker has the bodies of its world then.
 
         Raises:
-            StepFailed: It is nearer than that at the start.
+            StepFailed: A held object is nearer to another body than the gap of the line.
         """
-        others = [world_geometry(body) for body in (*self.robot.fixtures, *world.scene.values())]
-        along = {world.held[name].link for name in moves}  # what these links hold moves along
-        others += [(coal_geometry(o), self._pose(world, n, q)) for n, o in world.held.items() if o.link not in along]
-        least, request = 1.0, coal.DistanceRequest()
-        for name, move in moves.items():
-            shape, start, share, size = coal_geometry(world.held[name]), self._pose(world, name, q), 0.0, length(move)
-            for _ in range(MOST_ADVANCES if others else 0):
-                placed = _transform(start, share * move)
-                away = min(
-                    coal.distance(shape, placed, other, _transform(pose), request, coal.DistanceResult())
-                    for other, pose in others
-                )
-                if share == 0.0 and away < gap:
-                    raise StepFailed(f"{name} is {1e3 * away:.3g} mm from another body at its start, less than the gap")
-                if away - gap < NEAR or share >= least:
-                    break
-                share += (away - gap) / size
-            least = min(least, share) if others else least
-        return least
-
-    def _pose(self, world: TaskWorld, name: str, q: Array) -> Array:
-        """Return the pose of a held object in the world, shape (4, 4)."""
-        one = world.held[name]
-        return self.robot.link_pose(q, one.link) @ one.pose
-
-    def _line(
-        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, poses: Sequence[Mapping[str, Array]],
-        timing: Timing | None,
-    ) -> StepPlan:  # fmt: skip
-        """Return straight lines from poses of frames to poses, with blends between them."""
+        poses = waypoints(world, step, q)
         self.become(world)
-        query = line_query(
+        return line_query(
             self.checker, q, list(poses), frame=None, blend=_blend(poses), speed=step.speed,
             timing=False if timing is None else _timing_in(world, timing), problem=lambda goals: self.problem,
         )  # fmt: skip
+
+    def _line(
+        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
+    ) -> StepPlan:
+        """Return straight lines from poses of frames to poses, with blends between them."""
+        query = self.line_query(world, step, q, timing)
         found = plan_along(self.checker, query, self._deadline, self._ends)
         if not found or found.path is None:
             raise StepFailed(found.reason, " ".join((f"{found.end}", *found.blocked_by)))
@@ -362,7 +273,7 @@ class StepPlanner:
             StepFailed: The open hand is in contact with it.
         """
         one, palm = during.held[step.object], self.robot.hands[step.hand].palm
-        pose = np.linalg.inv(self.robot.link_pose(q, palm)) @ self._pose(during, step.object, q)
+        pose = np.linalg.inv(self.robot.link_pose(q, palm)) @ held_pose(during, step.object, q)
         turn = pin.Quaternion(pose[:3, :3]).coeffs()
         placed = one.model_copy(
             update={"position": tuple(pose[:3, 3]), "orientation": tuple(turn), "links": None, "link": palm}
@@ -413,12 +324,7 @@ class StepPlanner:
 
     def _retreat(self, world: TaskWorld, step: RetreatStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a hand's way from what it released, which it may touch on the first part of the way only."""
-        hand = self.robot.hands[step.hand]
-        frame = frame_of(self.robot, step.hand, world.held)
-        pose = self.robot.link_pose(q, frame.link) @ frame.pose
-        direction = -np.asarray(hand.axis, float) if step.direction is None else np.asarray(step.direction, float)
-        pose[:3, 3] += step.distance / length(direction) * (pose[:3, :3] @ direction)
-        found = self._line(world, step, q, [{step.hand: pose}], timing)
+        found = self._line(world, step, q, timing)
         pairs = world.leaving_pairs(step.hand)
         if not pairs:
             return replace(found, left=0.0)
@@ -498,8 +404,3 @@ def _timing_in(world: TaskWorld, timing: Timing) -> Timing:
         known = {*world.held, *world.robot.hands, *world.robot.link_names}
         speeds = {name: speed for name, speed in speeds.items() if name in known} or None
     return replace(timing, minimum_duration=0.0, start_velocity=(), start_acceleration=(), max_tool_speed=speeds)
-
-
-def _transform(pose: Array, move: Array | float = 0.0) -> coal.Transform3s:
-    """Return a pose, shape (4, 4), moved by a displacement in the world, shape (3,), for Coal."""
-    return coal.Transform3s(pose[:3, :3], pose[:3, 3] + move)

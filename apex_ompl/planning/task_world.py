@@ -238,7 +238,14 @@ def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]
     elif isinstance(step, TogetherStep):
         for k, one in enumerate(step.steps):
             yield from ((f"steps.{k}.{name}", value, expected) for name, value, expected in _faults(world, one))
-    elif isinstance(step, AttachStep):
+    elif isinstance(step, AttachStep | DetachStep | AllowStep):
+        yield from _body_faults(world, step)
+    elif isinstance(step, HandStep | ReleaseStep | GraspStep | RetreatStep):
+        yield from _hand_faults(world, step)
+
+
+def _body_faults(world: TaskWorld, step: AttachStep | DetachStep | AllowStep) -> Iterable[tuple[str, object, str]]:
+    if isinstance(step, AttachStep):
         if step.object not in world.scene:
             yield "object", step.object, f"expected an obstacle: {', '.join(world.scene) or 'there is none'}"
         elif world.scene[step.object].half_space is not None or world.scene[step.object].points is not None:
@@ -255,8 +262,6 @@ def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]
             if name not in known:
                 named = ", ".join((*world.held, *world.scene, *fixtures))
                 yield "pairs", name, f"expected links of the robot, or: {named or 'there is no object'}"
-    elif isinstance(step, HandStep | ReleaseStep | GraspStep | RetreatStep):
-        yield from _hand_faults(world, step)
 
 
 def _hand_faults(

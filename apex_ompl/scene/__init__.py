@@ -46,7 +46,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "constraints": "FixedOrientation OnLine OnPlane Pose PoseTolerance RelativePose ToolRegion Upright",
         "points": "points_from_depth",
         "problem": "Alignment Goal GraspGoal MoveStep PoseTarget Problem Tolerance",
-        "steps": "AllowStep AttachStep DetachStep GraspStep HandStep LineStep ReleaseStep RetreatStep TogetherStep TurnStep "
-        "WaitStep",
+        "steps": "AllowStep AttachStep DetachStep GraspStep HandStep LineStep ReleaseStep RetreatStep TogetherStep "
+        "TurnStep WaitStep",
     },
 )

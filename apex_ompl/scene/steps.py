@@ -62,7 +62,10 @@ class Step(StrictModel):
     def _kind_first(self, others: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Return the fields with the kind, which is not left out as a default, and one name without a list."""
         data = {"kind": self.kind, **others(self)}
-        return {k: v[0] if k in ("frame", "objects", "group") and v is not None and len(v) == 1 else v for k, v in data.items()}
+        return {
+            k: v[0] if k in ("frame", "objects", "group") and v is not None and len(v) == 1 else v
+            for k, v in data.items()
+        }
 
 
 class MotionStep(Step):
@@ -308,10 +311,10 @@ class AllowStep(Step):
         return pairs if self.contact else f"{pairs} no longer"
 
 
-SimultaneousStep = Annotated[
-    LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep | AttachStep | DetachStep,
-    Field(discriminator="kind"),
-]
+SimultaneousStep = (
+    LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep | AttachStep | DetachStep
+)
+"""A step that may happen beside others."""
 
 
 class TogetherStep(Step):
@@ -322,7 +325,7 @@ class TogetherStep(Step):
     """
 
     kind: Literal["together"] = "together"
-    steps: Annotated[tuple[SimultaneousStep, ...], Field(min_length=2)]
+    steps: Annotated[tuple[Annotated[SimultaneousStep, Field(discriminator="kind")], ...], Field(min_length=2)]
 
     @property
     def subject(self) -> str:
