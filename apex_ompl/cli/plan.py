@@ -14,8 +14,8 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.options import check_arguments
+from apex_ompl.planning.task_motion import task_fault
 from apex_ompl.planning.task_result import TaskResult
-from apex_ompl.planning.tasks import task_fault
 from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.timing import Timing, Trajectory

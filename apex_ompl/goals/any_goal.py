@@ -98,8 +98,8 @@ class AnyGoal:
         return states[self.in_turn(states)[:count]]
 
     def in_turn(self, states: Array) -> list[int]:
-        """Return the rows of states, shape (N, dof): the nearest of each goal in time, then the second ones, and so on."""
-        order = np.argsort(self._durations(states), kind="stable") if len(states) else []
+        """Return the rows of states, shape (N, dof): of each goal the nearest in time, then the second ones, etc."""
+        order = np.argsort(self._durations(states), kind="stable") if len(states) else np.empty(0, int)
         ranked, seen = list[tuple[int, int]](), Counter[int]()
         for k, row in enumerate(order):
             member = self._member(states[row])

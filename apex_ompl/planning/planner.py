@@ -187,9 +187,9 @@ class MotionPlanner:
                 self.world.load(problem)
             given = PlanOptions(**options)
 
-            def plan_to(goals: Problem, timeout: float, first: bool) -> PlanResult:
-                now = given if first else given.from_rest()
-                return self._plan(goals, planner, time.perf_counter(), replace(now, timeout=timeout))
+            def plan_to(goals: Problem, timeout: float, first: bool, group: Group | None) -> PlanResult:
+                now = replace(given if first else given.from_rest(), timeout=timeout, group=group)
+                return self._plan(goals, planner, time.perf_counter(), now)
 
             return plan_task(self._checker, problem, given, plan_to)
 

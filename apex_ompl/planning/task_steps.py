@@ -179,7 +179,7 @@ class StepPlanner:
         self.become(world)
         return line_query(
             self.checker, q, list(poses), frame=None, blend=_blend(poses), speed=step.speed,
-            timing=False if timing is None else _timing_in(world, timing), problem=lambda goals: self.problem,
+            timing=False if timing is None else timing_in(world, timing), problem=lambda goals: self.problem,
         )  # fmt: skip
 
     def _line(
@@ -291,7 +291,7 @@ class StepPlanner:
             StepFailed: There is none in time.
         """
         world, states, limits = plan.world, plan.path.states, self.robot.limits
-        how, clear = _timing_in(world, timing), [nan]
+        how, clear = timing_in(world, timing), [nan]
         scaled = how.limits(limits, self.robot.joint_names)
         more = how.motion_limits(self.robot, tuple(world.held.values()), self.problem.payload)
 
@@ -397,7 +397,7 @@ def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
     return BLEND * min((way for way in ways if way > SAME_POINT), default=0.0)
 
 
-def _timing_in(world: TaskWorld, timing: Timing) -> Timing:
+def timing_in(world: TaskWorld, timing: Timing) -> Timing:
     """Return a timing of a step: from rest, and without tools that are not held then."""
     speeds = timing.max_tool_speed
     if isinstance(speeds, Mapping):
