@@ -55,7 +55,8 @@ class TaskGoal:
         for member in self.goal.members if isinstance(self.goal, AnyGoal) else (self.goal,):
             end: Array = member.inverse.descend(q, tolerance=TOLERANCE).states[0]
             if np.abs(end - q).max() <= NEAR and within(member.errors(end), member.bounds):
-                return self.held_at_start(end[None])[0]
+                kept: Array = self.held_at_start(end[None])[0]
+                return kept
         return None
 
 

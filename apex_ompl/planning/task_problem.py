@@ -11,6 +11,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Vector
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import LineStep, Step
+from apex_ompl.util.schema import validate
 
 
 def steps_of(robot: Robot, steps: Sequence[Step | Mapping[str, Any]]) -> list[Any]:
@@ -35,6 +36,25 @@ def steps_of(robot: Robot, steps: Sequence[Step | Mapping[str, Any]]) -> list[An
         else:
             found.append(dict(step) if isinstance(step, Mapping) else step)
     return found
+
+
+def sequence_problem(robot: Robot, problem: Problem, steps: Sequence[Step | Mapping[str, Any]]) -> Problem:
+    """Return a problem with steps after its start, the first of which is its goal if it is a motion of all joints.
+
+    Args:
+        robot: The robot.
+        problem: A problem whose goal is its start.
+        steps: The steps.
+
+    Raises:
+        ApexError: A step is faulty.
+    """
+    given = {"name": problem.name, "robot": problem.robot, "start": problem.start, "after": steps_of(robot, steps)}
+    first, *rest = read = validate(Problem, given, "steps").after
+    if not isinstance(first, MoveStep) or first.group is not None or first.blend is not None:
+        return problem.model_copy(update={"after": read})
+    goal = first.goal.with_joints(problem.start)
+    return problem.model_copy(update={"goal": goal, "after": tuple(rest)})
 
 
 def _goal(robot: Robot, goal: Any) -> Any:
