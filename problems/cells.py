@@ -64,7 +64,7 @@ def _turn(angle: float) -> list[float]:
     return _rounded([0.0, 0.0, np.sin(angle / 2.0), np.cos(angle / 2.0)], 8)
 
 
-def _box(name: str, size: Sequence[float], position: Sequence[float], **fields: Any) -> Entry:
+def _box(name: str, size: Sequence[float] | Array, position: Sequence[float], **fields: Any) -> Entry:
     return {"name": name, "box": _rounded(size), "position": _rounded(position), **fields}
 
 
@@ -82,7 +82,7 @@ def _bin(name: str, center: Array, inside: Array, height: float) -> list[Entry]:
     ]
 
 
-def gripper_grasps(size: Sequence[float], width: float = 0.08, count: int = GRASPS) -> list[Entry]:
+def gripper_grasps(size: Sequence[float] | Array, width: float = 0.08, count: int = GRASPS) -> list[Entry]:
     """Return grasps of an upright box by a parallel gripper from above, the steepest first.
 
     The fingers close along y of the hand, on faces that are nearer to each other than they open.
@@ -149,7 +149,7 @@ def _pick_and_place(rng: np.random.Generator) -> Entry:
     return {"robot": "panda", "scene": scene, "start": start, "goal": goal, "after": after}
 
 
-def hand_grasps(size: Sequence[float], heights: Sequence[float]) -> list[Entry]:
+def hand_grasps(size: Sequence[float] | Array, heights: Sequence[float]) -> list[Entry]:
     """Return grasps of an upright box of square cross-section by a hand from its four sides, the palm flat on a face.
 
     Args:
@@ -176,7 +176,7 @@ def _home() -> tuple[dict[str, float], dict[str, float]]:
     return start, {name: q for name, q in start.items() if "joint" in name}
 
 
-def _standing(name: str, size: Sequence[float], place: Sequence[float], turn: float, heights: Sequence[float]) -> Entry:
+def _standing(name: str, size: Array, place: Array, turn: float, heights: Sequence[float]) -> Entry:
     """Return a box that stands on the table, with its grasps."""
     return _box(name, size, (*place, size[2] / 2), orientation=_turn(turn), grasps=hand_grasps(size, heights))
 
@@ -184,7 +184,9 @@ def _standing(name: str, size: Sequence[float], place: Sequence[float], turn: fl
 def _place(name: str, position: Sequence[float], **fields: Any) -> Entry:
     """Return the goal that an object stands somewhere, turned as it likes, and comes from above."""
     upright = {"orientation": [0.0, 0.0, 0.0, 1.0], "free_turn": "z"}
-    return {"poses": [{"frame": name, "position": _rounded(position), **upright, "approach": [0.0, 0.0, -0.06], **fields}]}
+    return {
+        "poses": [{"frame": name, "position": _rounded(position), **upright, "approach": [0.0, 0.0, -0.06], **fields}]
+    }
 
 
 def _let_go(hand: str) -> list[Entry]:

@@ -103,7 +103,10 @@ class MeshStage:
 
     def allow(self, allowed: Iterable[frozenset[str]]) -> None:
         """Let pairs of bodies touch, by their names, besides the robot's own pairs, and no others."""
-        self.allowed = frozenset(allowed)
+        before, self.allowed = self.allowed, frozenset(allowed)
+        links = {self.solids[k].name for k in range(self.links)}
+        if not any(pair <= links for pair in before ^ self.allowed):
+            return
         self.geometry.removeAllCollisionPairs()
         for pair in self._robot.geometry.collisionPairs:
             if not self._may_touch(pair.first, pair.second):

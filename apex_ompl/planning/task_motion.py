@@ -33,7 +33,7 @@ from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
 
 SHARES = (0.5, 0.4, 0.3, 0.2, 0.1, 0.05)  # of the shorter motion, by which two motions may overlap
-SPACING = 2e-3  # of samples of the distance of hands from where a step ends [s]
+SAMPLES = 24  # at which the distance of hands from where a step ends is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,12 +133,13 @@ def blend(planner: StepPlanner, first: StepPlan, second: StepPlan, timing: Timin
 
 def _distance(robot: Robot, motion: Trajectory, corner: Array) -> float:
     """Return the largest distance of the origins of hands from where they are at a state, shape (dof,) [m]."""
-    worst = 0.0
-    states = motion(np.linspace(0.0, motion.duration, max(2, int(np.ceil(motion.duration / SPACING)) + 1)))
+    worst, states = 0.0, motion(np.linspace(0.0, motion.duration, SAMPLES))
     for hand in robot.hands.values():
         point = np.append(hand.point, 1.0)
-        at = robot.link_pose(corner, hand.palm) @ point
-        worst = max([worst, *(float(np.linalg.norm(robot.link_pose(q, hand.palm) @ point - at)) for q in states)])
+        at = (robot.link_pose(corner, hand.palm) @ point)[:3]
+        places = np.array([(robot.link_pose(q, hand.palm) @ point)[:3] for q in states])
+        between = np.linalg.norm(np.diff(places, axis=0), axis=1).max() / 2.0
+        worst = max(worst, float(np.linalg.norm(places - at, axis=1).max() + between))
     return worst
 
 

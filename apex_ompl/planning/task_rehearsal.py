@@ -66,20 +66,21 @@ class Rehearsal:
             stop: Whether no time is left.
         """
         self.planner, self.stages, self.seed, self.stop = planner, stages(planner.problem), seed, stop
-        self._visits = 0
+        self._visits, self._thorough = 0, False
 
-    def later_goals(self, k: int, world: TaskWorld, q: Array) -> list[Array]:
+    def later_goals(self, k: int, world: TaskWorld, q: Array, thorough: bool = False) -> list[Array]:
         """Return goals of the stages after one, all of which can be reached and left by their steps.
 
         Args:
             k: Number of the stage.
             world: The world at its goal.
             q: Its goal, shape (dof,).
+            thorough: Whether lines are led around obstacles and limits, by motions that keep the poses of their frames.
 
         Raises:
             StepFailed: There are none, as far as was tried.
         """
-        self._visits = 0
+        self._visits, self._thorough = 0, thorough
         return self._from(k, world, q)
 
     def _from(self, k: int, world: TaskWorld, q: Array) -> list[Array]:
@@ -142,7 +143,8 @@ class Rehearsal:
             return q
         tracker = LineTracker(self.planner.checker, query.tools, ToolPath.through(query.poses, query.blend), self.stop)
         track = tracker.tracked(Track(tracker.grid[:1], q[None]))
-        if len(track.u) < len(tracker.grid) or tracker.free_count(track) < len(track.u):
+        track = track.upto(tracker.free_count(track))
+        if len(track.u) < len(tracker.grid) and self._thorough:
             track = tracker.follow(q)
         if len(track.u) < len(tracker.grid):
             end = dead_end(tracker, track)

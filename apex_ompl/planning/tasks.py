@@ -43,6 +43,7 @@ from apex_ompl.util.process import running
 EXAMINATION = 0.5  # of the time, at most, for the search for goals of a motion once one is found
 ROUNDS = 7  # of sampling goals, after those of the set-up
 ALTERNATIVES = 64  # states of goals of which any will do that follow those of the set-up
+THOROUGH = 24  # goals that are rehearsed thoroughly where a quick rehearsal rejects all
 MOTION_SHARE = 0.4  # of the time left, for a motion where other choices or further motions follow
 MOST_CAUSES = 3  # that a reason names
 WORDS = "no goal was found from which the steps after it can be done"
@@ -59,8 +60,7 @@ class TaskSearch:
     Attributes:
         goes_back: Whether the steps after a goal are rehearsed before it is chosen, and other choices tried where a
             step fails. Otherwise the nearest goal of each motion is taken, and the task fails where it does not suit.
-        wanted: Goals of the last motion among which the planner chooses; of the others, the number of those that
-            are compared.
+        wanted: Goals of the last motion among which the planner chooses.
     """
 
     goes_back: bool = True
@@ -263,7 +263,8 @@ class TaskPlanner:
 
     def _rehearsed(self, k: int, world: TaskWorld, made: TaskGoal, setup: PlanningSetup) -> Iterator[list[_Choice]]:
         """Yield goals whose later steps can be done as far as a rehearsal shows, a few at a time."""
-        found = list[_Choice]()
+        found, doubtful = list[_Choice](), list[tuple[Array, str]]()
+        wanted = self._search.wanted if k + 1 == len(self._stages) else 1
         until = self._deadline.remaining * (1.0 - EXAMINATION)
         for goal in self._candidates(made, setup):
             if self._ends() or (found and self._deadline.remaining <= until):
@@ -274,12 +275,24 @@ class TaskPlanner:
                     found.append(_Choice(goal, self._rehearsal.later_goals(k, world, goal)))
             except StepFailed as failure:
                 self.rejected[failure.cause] += 1
+                doubtful.append((goal, failure.cause))
                 continue
-            if len(found) == self._search.wanted:
+            if len(found) == wanted:
                 yield found
                 found = []
         if found:
             yield found
+        for goal, cause in doubtful[:THOROUGH]:
+            if self._ends():
+                break
+            self.rejected[cause] -= 1
+            try:
+                with self._interruptible():
+                    later = self._rehearsal.later_goals(k, world, goal, thorough=True)
+            except StepFailed as failure:
+                self.rejected[failure.cause] += 1
+                continue
+            yield [_Choice(goal, later)]
 
     def _candidates(self, made: TaskGoal, setup: PlanningSetup) -> Iterator[Array]:
         """Yield goals, the nearest first; then others that are sampled, where the goal is in the workspace."""
@@ -300,12 +313,12 @@ class TaskPlanner:
         times = {**result.times, "steps": steps, "total": result.times.get("total", 0.0) + steps}
         return replace(
             result, problem=self._problem, times=times, goals_examined=self.examined,
-            goals_rejected=dict(self.rejected), checks=result.checks + self._steps.checker.check_counts.states,
+            goals_rejected=dict(+self.rejected), checks=result.checks + self._steps.checker.check_counts.states,
         )  # fmt: skip
 
     def _failed(self, reason: str) -> TaskResult:
         """Return the result of a task whose steps cannot be done."""
-        counts = self.rejected.most_common(MOST_CAUSES)
+        counts = (+self.rejected).most_common(MOST_CAUSES)
         causes = "; ".join(f"{cause} ({n} of {self.examined} goals)" for cause, n in counts)
         robot, status = self._checker.robot, PlanStatus.STEP_FAILED
         if self._deadline.for_search <= 0.0:
