@@ -29,7 +29,7 @@ from apex_ompl.scene.steps import (
     TogetherStep,
 )
 from apex_ompl.timing import Timing, Trajectory
-from apex_ompl.timing.trajectory import ROUNDING
+from apex_ompl.timing.trajectory import ROUNDING, joined
 from apex_ompl.types import Array
 
 SHARES = (0.5, 0.4, 0.3, 0.2, 0.1, 0.05)  # of the shorter motion, by which two motions may overlap
@@ -87,13 +87,34 @@ def whole(
     result = replace(TaskResult.of(found), steps=tuple(steps))
     if not timed:
         return result
-    motion = superposed(list(zip(motions, starts, strict=True)))
+    motion = _through(motions, starts, [one is not None for one in blends])
     uses = [found.limit_use, *(plan.use for plan in plans), *(one.use for one in blends if one is not None)]
     use = {name: max(one.get(name, 0.0) for one in uses) for name in dict.fromkeys(n for one in uses for n in one)}
     return replace(
         result, trajectory=motion, limit_use=use | dict(motion.use(planner.robot.limits)),
         motion_clearance=min(step.clearance for step in steps), deviation=max(plan.deviation for plan in plans),
     )  # fmt: skip
+
+
+def _through(motions: Sequence[Trajectory], starts: Sequence[float], blended: Sequence[bool]) -> Trajectory:
+    """Return one motion through others, some of which start before the one before them ends.
+
+    Args:
+        motions: The motions.
+        starts: When each starts [s].
+        blended: Whether each but the last one overlaps with the next one.
+    """
+    parts, first = list[Trajectory](), 0
+    for k in range(len(motions)):
+        if k + 1 < len(motions) and blended[k]:
+            continue
+        one = motions[k]
+        if k > first:
+            one = superposed([(motions[i], starts[i] - starts[first]) for i in range(first, k + 1)])
+            one.positions[0], one.positions[-1] = motions[first].positions[0], motions[k].positions[-1]  # bit for bit
+        parts.append(one)
+        first = k + 1
+    return joined(parts)
 
 
 def blend(planner: StepPlanner, first: StepPlan, second: StepPlan, timing: Timing) -> _Blend | None:
