@@ -115,7 +115,7 @@ def _pick_and_place(rng: np.random.Generator) -> Entry:
     centers = np.array([[0.45, -0.27], [0.45, 0.27]]) + rng.uniform(-0.05, 0.05, (2, 2))
     heights, inside = rng.uniform(0.06, 0.14, 2), rng.uniform(0.22, 0.3, (2, 2))
     size = np.array([*rng.uniform(0.04, 0.06, 2), rng.uniform(0.09, 0.14)]).round(4)
-    reach = inside - 0.5 * np.linalg.norm(size[:2]) * 2.0 - 0.01
+    reach = inside - np.linalg.norm(size[:2]) - 2.0 * np.array([[0.02], [0.035]])  # room for fingers
     at = centers + rng.uniform(-0.5, 0.5, (2, 2)) * reach
     scene = [
         *_bin("left_bin", centers[0], inside[0], heights[0]), *_bin("right_bin", centers[1], inside[1], heights[1]),
