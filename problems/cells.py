@@ -113,8 +113,9 @@ def gripper_grasps(size: Sequence[float] | Array, width: float = 0.08, count: in
 def _pick_and_place(rng: np.random.Generator) -> Entry:
     """Return a cell of a Panda between two bins."""
     centers = np.array([[0.45, -0.27], [0.45, 0.27]]) + rng.uniform(-0.05, 0.05, (2, 2))
-    heights, inside = rng.uniform(0.06, 0.14, 2), rng.uniform(0.22, 0.3, (2, 2))
-    size = np.array([*rng.uniform(0.04, 0.06, 2), rng.uniform(0.09, 0.14)]).round(4)
+    inside, size = rng.uniform(0.22, 0.3, (2, 2)), np.array([*rng.uniform(0.04, 0.06, 2), rng.uniform(0.09, 0.14)])
+    size = size.round(4)
+    heights = rng.uniform(0.05, size[2], 2)
     reach = inside - np.linalg.norm(size[:2]) - 2.0 * np.array([[0.02], [0.035]])  # room for fingers
     at = centers + rng.uniform(-0.5, 0.5, (2, 2)) * reach
     scene = [
@@ -195,14 +196,14 @@ def _let_go(hand: str) -> list[Entry]:
 
 def _stacking(rng: np.random.Generator) -> Entry:
     """Return a cell in which both hands stack three boxes."""
-    edge, tall = rng.uniform(0.055, 0.065), rng.uniform(0.14, 0.17)
+    edge, tall = rng.uniform(0.055, 0.065), rng.uniform(0.16, 0.18)
     size = np.array([edge, edge, tall]).round(4)
     tower = rng.uniform([0.48, 0.1], [0.56, 0.18])
     places = {
         "a": rng.uniform([0.4, 0.35], [0.55, 0.45]), "b": rng.uniform([0.4, -0.45], [0.55, -0.3]),
         "c": rng.uniform([0.5, 0.55], [0.6, 0.65]),
     }  # fmt: skip
-    scene = [_standing(n, size, at, rng.uniform(-np.pi, np.pi), (0.0, 0.03)) for n, at in places.items()]
+    scene = [_standing(n, size, at, rng.uniform(-np.pi, np.pi), (0.0, 0.03, 0.05)) for n, at in places.items()]
     scene.append(_box("lamp", (0.2, 0.2, 0.1), (rng.uniform(0.4, 0.6), rng.uniform(-0.1, 0.1), rng.uniform(0.85, 1.0))))
     start, home = _home()
     tables = {"a": "table_left", "b": "table_right", "c": "table_left"}
