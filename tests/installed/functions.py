@@ -175,6 +175,8 @@ def _use_tasks() -> None:
     assert apex_ompl.TaskResult.load("task.npz").as_dict() == task.as_dict()
     with apex_ompl.MotionPlanner(robot) as planner:
         assert planner.plan_task(apex_ompl.load_problem("handover"), timeout=20.0)
+    with apex_ompl.MotionPlanner("panda") as planner:
+        assert planner.sequence("home", [{"kind": "wait", "seconds": 1.0}], search=None, timeout=20.0).goal_time == 0.0
 
 
 def _use_records() -> None:
