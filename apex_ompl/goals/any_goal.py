@@ -105,6 +105,10 @@ class AnyGoal:
             seen[member] += 1
         return first.states[[int(order[k]) for _, k in sorted(ranked)][:count]]
 
+    def member_of(self, q: Array) -> int:
+        """Return the number of the first goal that a state, shape (dof,), reaches, or -1 of a joint configuration."""
+        return next((k for k, goal in enumerate(self.members) if within(goal.errors(q), goal.bounds)), -1)
+
     def sample(
         self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
     ) -> GoalSamples:

@@ -43,7 +43,8 @@ from apex_ompl.util.process import running
 EXAMINATION = 0.5  # of the time, at most, for the search for goals of a motion once one is found
 ROUNDS = 7  # of sampling goals, after those of the set-up
 ALTERNATIVES = 64  # states of goals of which any will do that follow those of the set-up
-THOROUGH = 24  # goals that are rehearsed thoroughly where a quick rehearsal rejects all
+MOST_FAILURES = 2  # of one grasp, or another goal of several, after which it is left out of quick rehearsals
+THOROUGH = 12  # goals that are rehearsed thoroughly where a quick rehearsal rejects all
 MOTION_SHARE = 0.4  # of the time left, for a motion where other choices or further motions follow
 MOST_CAUSES = 3  # that a reason names
 WORDS = "no goal was found from which the steps after it can be done"
@@ -265,16 +266,20 @@ class TaskPlanner:
         """Yield goals whose later steps can be done as far as a rehearsal shows, a few at a time."""
         found, doubtful = list[_Choice](), list[tuple[Array, str]]()
         wanted = self._search.wanted if k + 1 == len(self._stages) else 1
-        until = self._deadline.remaining * (1.0 - EXAMINATION)
+        until, failed = self._deadline.remaining * (1.0 - EXAMINATION), Counter[int]()
         for goal in self._candidates(made, setup):
             if self._ends() or (found and self._deadline.remaining <= until):
                 break
+            alternative = made.goal.member_of(goal) if isinstance(made.goal, AnyGoal) else -1
+            if alternative >= 0 and failed[alternative] == MOST_FAILURES:
+                continue
             self.examined += 1
             try:
                 with self._interruptible():
                     found.append(_Choice(goal, self._rehearsal.later_goals(k, world, goal)))
             except StepFailed as failure:
                 self.rejected[failure.cause] += 1
+                failed[alternative] += 1
                 doubtful.append((goal, failure.cause))
                 continue
             if len(found) == wanted:
@@ -303,7 +308,7 @@ class TaskPlanner:
         rng = np.random.default_rng([setup.seed, 1])
         if isinstance(goal, AnyGoal):
             yield from made.held_at_start(goal.nearest_states(setup.checker, rng, ALTERNATIVES))
-        for _ in range(ROUNDS):
+        for _ in range(1 if isinstance(goal, AnyGoal) else ROUNDS):
             found = sample(goal, setup.checker, rng, GOAL_STATES, GOAL_ATTEMPTS).states
             yield from made.held_at_start(found)
 

@@ -29,7 +29,17 @@ from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import finite_array
 
 if TYPE_CHECKING:
-    from apex_ompl.scene.bodies import GridFile, HalfSpace, MeshFile, PointFile, RoundBar, Sphere, VoxelFile
+    from apex_ompl.scene.bodies import (
+        ContactFace,
+        GridFile,
+        HalfSpace,
+        HandGrasp,
+        MeshFile,
+        PointFile,
+        RoundBar,
+        Sphere,
+        VoxelFile,
+    )
 
 KEPT_CLOUDS = 8  # temporary files that no obstacle has any more
 
@@ -55,6 +65,8 @@ class ObstacleFields(TypedDict, total=False):
     velocity: Sequence[float] | None
     trajectory: Sequence[Sequence[float]] | None
     appears: float
+    contact: ContactFace | Mapping[str, Any] | None
+    grasps: Sequence[HandGrasp | Mapping[str, Any]]
 
 
 class World:
