@@ -1,8 +1,8 @@
 """Cells: sequences of steps in random rooms, for one arm and for two, from an empty hand to the last object's place.
 
 ``pick_and_place``: a Panda takes a box with any of 50 grasps out of one bin and puts it into another one, turned as it
-likes. ``handover``: one hand of the dual-arm robot takes a bar from the table, the other one takes it over and puts it down.
-``stacking``: three boxes are stacked from the table, as in the paper, by whichever hand suits each.
+likes. ``handover``: one hand of the robot with two arms takes a bar from the table, the other one takes it over and puts
+it down. ``stacking``: both hands stack three boxes from the table, as in the paper.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.robot import load_robot
-from apex_ompl.scene.bodies import pose_fields, pose_matrix
+from apex_ompl.scene.bodies import pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_name
@@ -73,9 +73,11 @@ def _bin(name: str, center: Array, inside: Array, height: float) -> list[Entry]:
     x, y = inside
     cx, cy = center
     walls = [
-        ((WALL, y + 2 * WALL, height), (cx - (x + WALL) / 2, cy)), ((WALL, y + 2 * WALL, height), (cx + (x + WALL) / 2, cy)),
-        ((x, WALL, height), (cx, cy - (y + WALL) / 2)), ((x, WALL, height), (cx, cy + (y + WALL) / 2)),
-    ]  # fmt: skip
+        ((WALL, y + 2 * WALL, height), (cx - (x + WALL) / 2, cy)),
+        ((WALL, y + 2 * WALL, height), (cx + (x + WALL) / 2, cy)),
+        ((x, WALL, height), (cx, cy - (y + WALL) / 2)),
+        ((x, WALL, height), (cx, cy + (y + WALL) / 2)),
+    ]
     return [
         _box(f"{name}_floor", (x, y, WALL), (cx, cy, -WALL / 2)),
         *(_box(f"{name}_wall{k}", size, (*at, height / 2)) for k, (size, at) in enumerate(walls)),
@@ -128,9 +130,8 @@ def _pick_and_place(rng: np.random.Generator) -> Entry:
         place = centers[side] + rng.uniform(-0.5, 0.5, 2) * (inside[side] - edge * 1.5)
         if np.linalg.norm(place - at[side]) > 0.5 * np.linalg.norm(size[:2]) + 0.75 * edge + 0.005:
             scene.append(_box(f"other{k}", (edge, edge, tall), (*place, tall / 2)))
-    scene.append(
-        _box("box", size, (*at[0], size[2] / 2), orientation=_turn(rng.uniform(-np.pi, np.pi)), grasps=gripper_grasps(size))
-    )  # fmt: skip
+    turned = _turn(rng.uniform(-np.pi, np.pi))
+    scene.append(_box("box", size, (*at[0], size[2] / 2), orientation=turned, grasps=gripper_grasps(size)))
     robot = load_robot("panda")
     start = {name: round(float(q), 4) for name, q in zip(robot.joint_names, robot.home, strict=True)}
     target = {
@@ -252,12 +253,13 @@ def _handover(rng: np.random.Generator) -> Entry:
     between = [
         _place("bar", (rng.uniform(0.42, 0.58), y, z), approach=None) for y in (-0.08, 0.0, 0.08) for z in (0.35, 0.45)
     ]  # fmt: skip
+    taken_over = {"grasp": {"object": "bar", "hand": "right_hand", "approach": APPROACH}}
     after = [
         {"kind": "allow", "pairs": [["bar", "table_left"], ["bar", "table_right"]]},
         _take("left_hand", "bar"),
         {"kind": "line", "frame": "left_hand", "by": [0.0, 0.0, 0.08], "blend": 0.05},
         {"kind": "move", "goal": {"any_of": between}, "group": "left_arm"},
-        {"kind": "move", "goal": {"grasp": {"object": "bar", "hand": "right_hand", "approach": APPROACH}}, "group": "right_arm"},
+        {"kind": "move", "goal": taken_over, "group": "right_arm"},
         _take("right_hand", "bar"),
         *_let_go("left_hand"),
         {"kind": "move", "goal": _place("bar", (*to, tall / 2 + 1e-4))}, *_let_go("right_hand"),

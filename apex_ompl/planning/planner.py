@@ -595,7 +595,9 @@ def _check_is_no_line(problem: Problem) -> None:
         ParameterError: It has one.
     """
     for frame, approach in problem.goal.approaches.items():
-        raise ParameterError("goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task (apex-ompl sequence)")
+        raise ParameterError(
+            "goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task (apex-ompl sequence)"
+        )
 
 
 def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import MotionPlanner
-from apex_ompl.planning.tasks import TaskSearch
+from apex_ompl.planning import TaskSearch
 from apex_ompl.problems import cells
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.entry_point import run_script
