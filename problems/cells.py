@@ -1,8 +1,8 @@
 """Cells: sequences of steps in random rooms, for one arm and for two, from an empty hand to the last object's place.
 
 ``pick_and_place``: a Panda takes a box with any of 50 grasps out of one bin and puts it into another one, turned as it
-likes. ``handover``: one hand of the robot with two arms takes a bar from the table, the other one takes it over and puts
-it down. ``stacking``: both hands stack three boxes from the table, as in the paper.
+likes. ``handover``: one of two hands takes a bar from the table, the other one takes it over and puts it down.
+``stacking``: both hands stack three boxes from the table, as in the paper.
 """
 
 from __future__ import annotations
