@@ -1,10 +1,10 @@
 """Hands that hold objects in physics: by friction where that suffices, else by a weld.
 
 The synergy of a hand is commanded beyond the first contact with an object; its fingers are springs that yield, and the
-torque of the synergy is limited. While a hand closes, a soft weld without weight guides the object. An object that two
-links of a hand press on may then be welded to its palm; the weld yields a little, as fingers do. An object that two
-hands hold at once, as the ends of a tray, is welded to both palms, whether they touch it or not, and one that a link
-without a hand holds to that link.
+torque of the synergy is limited. While a hand closes on an object that no other one holds, a weld without weight guides
+it. An object that two links of a hand press on may then be welded to its palm; the weld yields a little, as fingers do.
+An object that two hands hold at once, as the ends of a tray, is welded to both palms, whether they touch it or not, and
+one that a link without a hand holds to that link.
 """
 
 from __future__ import annotations
@@ -101,8 +101,11 @@ class Grasps:
             hand: The hand.
             advance: Simulates up to a time [s], by default ``driver.advance``.
         """
-        self._press({hand})
-        (advance or self.driver.advance)(self.driver.time + CLOSING)
+        stands = [one.model_copy(update={"link": self._palm(hand)}) for one in self._objects.values()
+                  if one.name == name and name in self._standing]  # fmt: skip
+        with _Guide(self.driver, stands, ()):
+            self._press({hand})
+            (advance or self.driver.advance)(self.driver.time + CLOSING)
         self._hold(name, hand, WELD)
         self._standing.discard(name)
 
