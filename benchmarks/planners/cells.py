@@ -31,6 +31,7 @@ from benchmarks.lib import record
 DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/constraints")
 FOLDER = record.RESULTS.parent / "runs" / "cells"
 ROWS = {"sequence": TaskSearch(), "without going back": TaskSearch(goes_back=False), "without blends": TaskSearch()}
+COMPARED = "sequence", "without blends"  # by their makespans
 MOST_CAUSES = 4  # that a table names
 
 
@@ -54,7 +55,7 @@ def made(planner: MotionPlanner, kind: str, row: str, seed: int, timeout: float)
         "kind": kind, "row": row, "seed": seed, "solved": bool(result), "status": str(result.status), "cpu_s": spent,
         "makespan_s": None if result.trajectory is None else result.trajectory.duration,
         "examined": result.goals_examined, "rejected": dict(result.goals_rejected),
-        "blends": sum(step.blended for step in result.steps), "clearance_m": _clearance(result.motion_clearance),
+        "commit": record.session()["commit"], "blends": sum(step.blended for step in result.steps), "clearance_m": _clearance(result.motion_clearance),
     }  # fmt: skip
 
 
@@ -70,12 +71,12 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
     lines, causes = [head, ["---", "---", *["---:"] * (len(head) - 2)]], list[str]()
     for kind in dict.fromkeys(run["kind"] for run in runs):
         both = set.intersection(
-            *({r["seed"] for r in runs if (r["kind"], r["row"], r["solved"]) == (kind, row, True)} for row in ROWS)
+            *({r["seed"] for r in runs if (r["kind"], r["row"], r["solved"]) == (kind, row, True)} for row in COMPARED)
         )
         for row in ROWS:
             mine = sorted((r for r in runs if (r["kind"], r["row"]) == (kind, row)), key=lambda r: r["seed"])
             spent = record.percentiles([r["cpu_s"] for r in mine[1:]], 50, 95)
-            makespans = record.percentiles([r["makespan_s"] for r in mine if r["seed"] in both], 50, 95)
+            makespans = record.percentiles([r["makespan_s"] for r in mine if r["seed"] in both and r["solved"]], 50, 95)
             examined = record.percentiles([r["examined"] for r in mine], 50)[0]
             first = mine[0]["cpu_s"] if mine else float("nan")
             solved = f"{sum(r['solved'] for r in mine)}/{len(mine)}"
@@ -88,7 +89,7 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
             causes.append(f"- {kind}, {row}: {named or 'nothing'}")
     rows = "\n".join(record.row(line) for line in lines)
     return (
-        f"{rows}\n\nMakespans are of the cells that all rows solve. What failed, by cause and number of choices:\n\n"
+        f"{rows}\n\nMakespans are of the cells that are solved with and without blends. What failed, by cause and number of choices:\n\n"
         + ("\n".join(causes))
     )
 
@@ -110,14 +111,10 @@ def main() -> None:
                     run = made(_planner(kind), kind, row, seed, args.timeout)
                     write_atomically(file, json.dumps(run).encode())
                 runs.append(json.loads(Path(file).read_text()))
+    seeds, commits = f"{args.first}-{args.first + args.n - 1}", "; ".join(sorted({run["commit"] for run in runs}))
     record.write(
-        "cells",
-        {"runs": runs},
-        table(runs),
-        N=args.n,
-        seeds=f"{args.first}-{args.first + args.n - 1}",
-        timeout=args.timeout,
-    )
+        "cells", {"runs": runs}, table(runs), N=args.n, seeds=seeds, timeout=args.timeout, run_commits=commits
+    )  # fmt: skip
 
 
 _planners: dict[str, MotionPlanner] = {}
