@@ -55,7 +55,8 @@ def made(planner: MotionPlanner, kind: str, row: str, seed: int, timeout: float)
         "kind": kind, "row": row, "seed": seed, "solved": bool(result), "status": str(result.status), "cpu_s": spent,
         "makespan_s": None if result.trajectory is None else result.trajectory.duration,
         "examined": result.goals_examined, "rejected": dict(result.goals_rejected),
-        "commit": record.session()["commit"], "blends": sum(step.blended for step in result.steps), "clearance_m": _clearance(result.motion_clearance),
+        "commit": record.session()["commit"], "blends": sum(step.blended for step in result.steps),
+        "clearance_m": _clearance(result.motion_clearance),
     }  # fmt: skip
 
 
@@ -88,10 +89,9 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
             named = "; ".join(f"{cause} ({n})" for cause, n in counts.most_common(MOST_CAUSES))
             causes.append(f"- {kind}, {row}: {named or 'nothing'}")
     rows = "\n".join(record.row(line) for line in lines)
-    return (
-        f"{rows}\n\nMakespans are of the cells that are solved with and without blends. What failed, by cause and number of choices:\n\n"
-        + ("\n".join(causes))
-    )
+    of = "Makespans are of the cells that are solved with and without blends."
+    failed = "What failed, by cause and number of choices:"
+    return "\n\n".join([rows, f"{of} {failed}", "\n".join(causes)])
 
 
 def main() -> None:
