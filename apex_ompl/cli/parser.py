@@ -111,7 +111,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"apex-ompl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    _add_plan(commands)  # in the order of the help text
+    _add_plan(commands, "plan", "plan a path for a problem, to its goal")  # in the order of the help text
+    _add_plan(commands, "sequence", "plan a problem to its goal and all steps after it, as one motion")
     _add_run(commands)
     _add_ros2(commands)
     _add_pictures(commands)
@@ -132,8 +133,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser("plan", help="plan a path for a problem")
+def _add_plan(commands: Commands[argparse.ArgumentParser], name: str, text: str) -> None:
+    parser = commands.add_parser(name, help=text)
     parser.add_argument("problem", help=PROBLEM_HELP)
     parser.add_argument("--planner", help="see 'apex-ompl planners' (default: apex)")
     parser.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
@@ -158,7 +159,6 @@ def _add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "--calm-factor", type=float, default=1.1, metavar="FACTOR",
         help="duration of a calm motion as a multiple of the fastest one's (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--to-goal", action="store_true", help="leave out the steps after the goal")
     parser.add_argument("--no-timing", action="store_true", help="leave the path without times")
     parser.add_argument(
         "--timing-method", default="ruckig", metavar="NAME",

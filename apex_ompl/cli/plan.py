@@ -1,4 +1,4 @@
-"""The command ``apex-ompl plan``."""
+"""The commands ``apex-ompl plan`` and ``apex-ompl sequence``."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.options import check_arguments
+from apex_ompl.planning.task_motion import task_fault
 from apex_ompl.planning.task_result import TaskResult
-from apex_ompl.planning.tasks import task_fault
 from apex_ompl.result import SUFFIXES, PlanResult, PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.timing import Timing, Trajectory
@@ -77,7 +77,10 @@ def run(parsed: argparse.Namespace) -> int:
     )  # fmt: skip
     check_arguments(parsed.timeout, parsed.seed)
     problem = load_problem(parsed.problem)
-    result = (plan_task if (problem.after or problem.goal.approaches) and not parsed.to_goal else plan)(
+    whole = parsed.command == "sequence"
+    if problem.after and not whole:
+        print("apex-ompl: note: the steps after the goal are left out; apex-ompl sequence plans them", file=sys.stderr)
+    result = (plan_task if whole else plan)(
         problem,
         planner=parsed.planner,
         timeout=parsed.timeout,

@@ -103,14 +103,15 @@ class MeshStage:
 
     def allow(self, allowed: Iterable[frozenset[str]]) -> None:
         """Let pairs of bodies touch, by their names, besides the robot's own pairs, and no others."""
-        links = {solid.name for number, solid in self.solids.items() if number < self.links}
         before, self.allowed = self.allowed, frozenset(allowed)
-        if any(pair <= links for pair in before ^ self.allowed):
-            self.geometry.removeAllCollisionPairs()
-            for pair in self._robot.geometry.collisionPairs:
-                if not self._may_touch(pair.first, pair.second):
-                    self.geometry.addCollisionPair(pair)
-            self._pair_up()
+        links = {self.solids[k].name for k in range(self.links)}
+        if not any(pair <= links for pair in before ^ self.allowed):
+            return
+        self.geometry.removeAllCollisionPairs()
+        for pair in self._robot.geometry.collisionPairs:
+            if not self._may_touch(pair.first, pair.second):
+                self.geometry.addCollisionPair(pair)
+        self._pair_up()
 
     def _pair_up(self) -> None:
         """Make Pinocchio's data for the pairs of links."""

@@ -1,10 +1,10 @@
 """Hands that hold objects in physics: by friction where that suffices, else by a weld.
 
 The synergy of a hand is commanded beyond the first contact with an object; its fingers are springs that yield, and the
-torque of the synergy is limited. While a hand closes, a soft weld without weight guides the object. An object that two
-links of a hand press on may then be welded to its palm; the weld yields a little, as fingers do. An object that two
-hands hold at once, as the ends of a tray, is welded to both palms, whether they touch it or not, and one that a link
-without a hand holds to that link.
+torque of the synergy is limited. While a hand closes on an object that no other one holds, a weld without weight guides
+it. An object that two links of a hand press on may then be welded to its palm; the weld yields a little, as fingers do.
+An object that two hands hold at once, as the ends of a tray, is welded to both palms, whether they touch it or not, and
+one that a link without a hand holds to that link.
 """
 
 from __future__ import annotations
@@ -61,21 +61,28 @@ class Grasps:
         friction: Names of the objects that friction holds in the hands that hold them at the start; others are welded.
     """
 
-    def __init__(self, driver: MujocoDriver, friction: Collection[str] | None = None) -> None:
-        """Take the objects to be in the hands.
+    def __init__(
+        self, driver: MujocoDriver, friction: Collection[str] | None = None, standing: Collection[str] = ()
+    ) -> None:
+        """Take the objects to be in the hands, or to stand somewhere.
 
         Args:
             driver: A robot whose fingers yield.
             friction: Names of the objects that friction holds in these, by default all.
+            standing: Names of the objects that no link holds at first.
         """
         self.driver, self.found = driver, list[GraspFound]()
         self.friction = {one.name for one in driver.twin.held} if friction is None else set(friction)
         self._objects = {one.name: one for one in driver.twin.held}
+        self._standing = set(standing)
+        for name in standing:
+            for link in driver.twin.welded_to(self._objects[name]):
+                driver.data.eq_active[driver.twin.model.equality(f"{name} {link}").id] = False
 
     def close(self) -> None:
         """Close the hands on what they hold at the start, while it is guided, and let friction hold what it can."""
         driver = self.driver
-        objects = self._objects.values()
+        objects = [one for one in self._objects.values() if one.name not in self._standing]
         held = [(one, hand) for one in objects if one.touch_links != () for hand in hands_of(driver.robot, one)]
         with _Guide(driver, [one for one in objects if driver.twin.welded_to(one)], self.friction):
             self._press({hand for _, hand in held})
@@ -94,9 +101,13 @@ class Grasps:
             hand: The hand.
             advance: Simulates up to a time [s], by default ``driver.advance``.
         """
-        self._press({hand})
-        (advance or self.driver.advance)(self.driver.time + CLOSING)
+        stands = [one.model_copy(update={"link": self._palm(hand)}) for one in self._objects.values()
+                  if one.name == name and name in self._standing]  # fmt: skip
+        with _Guide(self.driver, stands, ()):
+            self._press({hand})
+            (advance or self.driver.advance)(self.driver.time + CLOSING)
         self._hold(name, hand, WELD)
+        self._standing.discard(name)
 
     def open(self, hand: str) -> None:
         """Take the pressure from a hand that is about to open."""

@@ -7,10 +7,12 @@ region is a goal of this kind as well: poses that are drawn in the region.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals import goal_sampling as single
@@ -37,6 +39,7 @@ class _First(NamedTuple):
 
     Attributes:
         states: Free states, shape (N, dof).
+        members: Number of the goal that each reaches, -1 of joint configurations, shape (N,).
         order: Numbers of the goals to be sampled in full.
         attempts: Number of descents.
         converged: Number of those that reached a goal.
@@ -44,6 +47,7 @@ class _First(NamedTuple):
     """
 
     states: Array
+    members: NDArray[np.intp]
     order: list[int]
     attempts: int
     converged: int
@@ -81,6 +85,29 @@ class AnyGoal:
             errors, bounds = goal.errors(q), goal.bounds
             least = 0.0 if within(errors, bounds) else min(least, single.relative_error(errors, bounds))
         return {ANY: least}
+
+    def nearest_states(self, checker: CollisionChecker, rng: np.random.Generator, count: int) -> Array:
+        """Return free states that reach goals, by a few descents for each: the nearest of each goal in turn.
+
+        Args:
+            checker: Checks the states for collision.
+            rng: Source of random numbers.
+            count: Most states.
+
+        Returns:
+            Shape (N, dof).
+        """
+        first = self._first(checker, rng)
+        order = np.argsort(self._durations(first.states), kind="stable") if len(first.states) else np.empty(0, np.intp)
+        ranked, seen = list[tuple[int, int]](), Counter[int]()
+        for k, member in enumerate(first.members[order].tolist()):
+            ranked.append((seen[member], k))
+            seen[member] += 1
+        return first.states[[int(order[k]) for _, k in sorted(ranked)][:count]]
+
+    def member_of(self, q: Array) -> int:
+        """Return the number of the first goal that a state, shape (dof,), reaches, or -1 of a joint configuration."""
+        return next((k for k, goal in enumerate(self.members) if within(goal.errors(q), goal.bounds)), -1)
 
     def sample(
         self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
@@ -128,7 +155,7 @@ class AnyGoal:
         """Return free states by a few descents for each goal, and the goals to be sampled in full."""
         least = np.full(len(self.members), np.inf)  # duration to the nearest free state of each goal [s]
         reached = np.zeros(len(self.members), bool)
-        states, attempts, converged, blocked = [self.states], 0, len(self.states), ""
+        states, counts, attempts, converged, blocked = [self.states], dict[int, int](), 0, len(self.states), ""
         each = int(np.clip(DESCENTS // max(len(self.members), 1), LEAST_DESCENTS, MOST_DESCENTS))
         for k, goal in enumerate(self.members):
             seeds = np.tile(self.start, (each, 1))
@@ -148,11 +175,13 @@ class AnyGoal:
             if len(free):
                 least[k] = float(self._durations(free).min())
                 states.append(free)
+                counts[k] = len(free)
         free = self.states[[checker.is_free(q) for q in self.states]]
         if len(self.states) and not len(free):
             blocked = str(next(iter(checker.contacts(self.states[0])), "in collision"))
         order = np.lexsort([least, ~reached])[: EXAMINED if np.isfinite(least).any() else UNTRIED]
-        return _First(np.concatenate([free, *states[1:]]), order.tolist(), attempts, converged, blocked)
+        members = np.repeat([-1, *counts], [len(free), *counts.values()])
+        return _First(np.concatenate([free, *states[1:]]), members, order.tolist(), attempts, converged, blocked)
 
     def _durations(self, states: Array) -> Array:
         return direct_durations(self.start, states, self.robot.limits)

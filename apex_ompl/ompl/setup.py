@@ -16,6 +16,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample, sample_on_constraints
+from apex_ompl.goals.grasp_goal import pose_alternatives
 from apex_ompl.goals.pose_goal import PoseGoal, pose_goals
 from apex_ompl.ompl.constrained_space import constraint_of
 from apex_ompl.ompl.simple_setup import SimpleSetup
@@ -282,6 +283,10 @@ def workspace_goal(robot: Robot, problem: Problem) -> AlignmentGoal | PoseGoal |
     if problem.goal.poses is not None:
         poses = pose_goals(robot, problem.goal.poses, problem.attached, start)
         return poses[0] if len(poses) == 1 else AnyGoal(robot, poses, np.empty((0, robot.dof)), start)
+    if problem.goal.grasp is not None or problem.goal.all_of is not None:
+        alternatives = pose_alternatives(robot, problem, problem.goal)
+        grasps = [one for poses in alternatives for one in pose_goals(robot, poses, problem.attached, start)]
+        return AnyGoal(robot, grasps, np.empty((0, robot.dof)), start)
     if problem.goal.any_of is None:
         return alignment_goal(robot, problem)
     members, states = list[PoseGoal | AlignmentGoal](), [np.empty((0, robot.dof))]

@@ -18,12 +18,12 @@ from apex_ompl.drivers.twin_settings import TwinSettings
 from apex_ompl.drivers.vessels import filled
 from apex_ompl.physics.judges import Check, Intended, Judge
 from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun
-from apex_ompl.physics.trials import Trial
+from apex_ompl.physics.trials import Trial, grasped_later
 from apex_ompl.planning.task_result import TaskResult, TaskStep
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import GraspStep, ReleaseStep, Step
+from apex_ompl.scene.steps import GraspStep, ReleaseStep, Step, TogetherStep
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -97,11 +97,12 @@ class Executor:
             seed: Seed of the start, for the result.
             film: Width and height of a film [pixels].
         """
-        liquid = {held.name for held in trial.real.attached} - {held.name for held in trial.known.attached}
+        stand = {one.name for one in grasped_later(trial.known)}
+        liquid = {held.name for held in trial.real.attached} - {held.name for held in trial.known.attached} - stand
         own = replace(settings, friction=trial.friction * settings.friction, frictionless=liquid)
         self.robot, self.trial, self.seed, self.film = robot, trial, seed, film
         self.driver = MujocoDriver(robot, trial.real, settings=own, assumed=trial.known)
-        self.grasps = Grasps(self.driver, friction)
+        self.grasps = Grasps(self.driver, friction, stand)
         self.frames: Frames = []
         self._rows: list[tuple[float, Array, Array]] = []
         self._poses: dict[str, list[Array]] = {held.name: [] for held in trial.real.attached}
@@ -132,10 +133,16 @@ class Executor:
         assert motion is not None
         lost = [one for one in self.grasps.found if one.kind == LOST]
         after: list[Step | None] = [None, *plan.problem.after]
+        start: float | None = None  # of motions that go over into each other
         for planned, step in zip(plan.steps, after, strict=True):
             if driver.fault:
                 break
-            self._follow(planned, step, motion_of(self.robot, self.trial.known, motion, planned))
+            start = planned.start if start is None else start
+            if planned.blended:
+                continue
+            whole = replace(planned, start=start)
+            self._follow(planned, step, motion_of(self.robot, self.trial.known, motion, whole))
+            start = None
         self.wait(RESTING)
         still = {body.name for body in (*self.trial.known.scene, *self.robot.fixtures)}
         touched = [pair for pair in self._touched() if still & set(pair)]
@@ -146,15 +153,21 @@ class Executor:
 
     def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:
         driver, begin = self.driver, self.driver.time
-        if isinstance(step, ReleaseStep):
-            self.grasps.open(step.hand)
+        parts = step.steps if isinstance(step, TogetherStep) else (step,)
+        for one in parts:
+            if isinstance(one, ReleaseStep):
+                self.grasps.open(one.hand)
         if motion.duration > 0.0:
             driver.send(motion, max(driver.time, driver.end))
             self._to(driver.end)
-        if isinstance(step, ReleaseStep):
-            self.grasps.release(planned.released, step.hand, self._to)
-        if isinstance(step, GraspStep):
-            self.grasps.grasp(step.object, step.hand, self._to)
+        held = {one.name: one for one in planned.attached}
+        for one in parts:
+            if isinstance(one, ReleaseStep):
+                links = self.robot.hand_of(self.robot.hands[one.hand].palm)
+                mine = [name for name in planned.released if set(held[name].holders) & set(links)]
+                self.grasps.release(mine, one.hand, self._to)
+            if isinstance(one, GraspStep):
+                self.grasps.grasp(one.object, one.hand, self._to)
         self._steps.append((planned.title, round(begin, 4), round(driver.time, 4)))
 
     def _stood(self) -> dict[str, tuple[str, Array]]:
@@ -257,10 +270,10 @@ def intended(robot: Robot, plan: TaskResult) -> Mapping[str, Intended]:
     for planned, step in zip(plan.steps, (None, *plan.problem.after), strict=True):
         for held in planned.attached:
             found[held.name] = Intended(held.name, held.link, held.pose)
-        if not isinstance(step, ReleaseStep):
-            continue
-        links, end = robot.hand_of(robot.hands[step.hand].palm), planned.path.states[-1]
-        for name in planned.released:
+        parts = step.steps if isinstance(step, TogetherStep) else (step,)
+        hands = [one.hand for one in parts if isinstance(one, ReleaseStep)]
+        links, end = {k for hand in hands for k in robot.hand_of(robot.hands[hand].palm)}, planned.path.states[-1]
+        for name in planned.released if hands else ():
             one = next(held for held in planned.attached if held.name == name)
             pose = robot.link_pose(end, one.link) @ one.pose
             others = [link for link in one.holders if link not in links]

@@ -16,8 +16,9 @@ from apex_ompl.constraints.constraint_set import ConstraintSet
 from apex_ompl.drivers.twin_settings import with_mass
 from apex_ompl.drivers.vessels import liquid
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject
+from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.steps import AttachStep, GraspStep, TogetherStep
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number
 
@@ -106,8 +107,42 @@ def draw(robot: Robot, problem: Problem, seed: int | None, spread: Spread, densi
         real.append(_moved(robot, held, start, off[held.name], masses[held.name]))
     named = dict(zip(robot.joint_names, start.tolist(), strict=True))
     known = problem.model_copy(update={"start": named})
-    moved = known.model_copy(update={"attached": tuple(real)})
+    for one in grasped_later(problem):
+        aside, off[one.name], masses[one.name] = np.zeros(3), np.zeros(3), 1.0
+        if seed is not None:
+            aside[:2] = _in_ball(rng, spread.place)[:2]
+            off[one.name], masses[one.name] = aside, 1.0 + spread.mass * rng.uniform(-1.0, 1.0)
+        real.append(standing(robot, one, aside, masses[one.name], density))
+    free = {one.name for one in real}
+    scene = tuple(one for one in known.scene if one.name not in free)
+    moved = known.model_copy(update={"attached": tuple(real), "scene": scene})
     return Trial(known, moved.model_copy(update={"attached": (*real, *liquid(moved))}), friction, off, masses)
+
+
+def grasped_later(problem: Problem) -> tuple[Obstacle, ...]:
+    """Return the obstacles that steps of a problem take."""
+    steps = [one for step in problem.after for one in (step.steps if isinstance(step, TogetherStep) else (step,))]
+    names = {step.object for step in steps if isinstance(step, GraspStep | AttachStep)}
+    return tuple(one for one in problem.scene if one.name in names)
+
+
+def standing(robot: Robot, obstacle: Obstacle, off: Array, factor: float, density: float) -> AttachedObject:
+    """Return an obstacle as an object that can be taken, at a link that does not move.
+
+    Args:
+        robot: The robot.
+        obstacle: The obstacle.
+        off: Its distance from where the problem has it, shape (3,) [m].
+        factor: Factor of its mass.
+        density: Its density where it has no mass [kg/m^3].
+    """
+    link = next(name for name in robot.link_names if not robot.model.frames[robot.link_frame(name)].parentJoint)
+    pose = np.linalg.inv(robot.link_pose(robot.home, link)) @ obstacle.pose
+    pose[:3, 3] += robot.link_pose(robot.home, link)[:3, :3].T @ off
+    fields = {**given_fields(obstacle, MOTION), "link": link, **pose_fields(pose)}
+    made = with_mass(AttachedObject.model_validate(fields), density)
+    assert made.mass is not None
+    return made.model_copy(update={"mass": factor * made.mass})
 
 
 def _start(robot: Robot, problem: Problem, rng: np.random.Generator, spread: float) -> Array:

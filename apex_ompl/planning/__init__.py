@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from apex_ompl.planning.steps import prove as prove
     from apex_ompl.planning.steps import solve as solve
     from apex_ompl.planning.steps import time as time
+    from apex_ompl.planning.tasks import TaskSearch as TaskSearch
     from apex_ompl.planning.world import World as World
 
 __all__, __getattr__, __dir__ = lazy_names(
@@ -35,6 +36,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "query": "GoalSampler",
         "step_records": "FoundPath PlanQuery ProvedPath",
         "steps": "assemble check prove solve time",
+        "tasks": "TaskSearch",
         "world": "World",
     },
 )

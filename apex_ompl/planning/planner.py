@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path as FilePath
@@ -35,11 +35,13 @@ if TYPE_CHECKING:
     from apex_ompl.planning.lines import LineResult
     from apex_ompl.planning.query import Group, State, Target
     from apex_ompl.planning.task_result import TaskResult
+    from apex_ompl.planning.tasks import TaskSearch
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
     from apex_ompl.scene.bodies import Obstacle
     from apex_ompl.scene.constraints import Constraint
     from apex_ompl.scene.problem import PoseTarget, Problem
+    from apex_ompl.scene.steps import Step
     from apex_ompl.timing import Timing, Trajectory
     from apex_ompl.types import Array
 
@@ -162,9 +164,40 @@ class MotionPlanner:
                 self.world.load(problem)
             return self._plan(problem, planner, started, PlanOptions(**options))
 
+    def sequence(
+        self, start: State, steps: Sequence[Step | Mapping[str, Any]], planner: AnyPlanner | None = None, *,
+        name: str = "sequence", search: TaskSearch | None = None, **options: Unpack[ProblemKeywords],
+    ) -> TaskResult:  # fmt: skip
+        """Plan steps one after the other, in the world as it is now: motions, lines, grasps, releases and others.
+
+        Goals are chosen so that the later steps can be done, as which of the grasps of an object; see
+        `docs/sequences.md`. The world is the same afterwards.
+
+        Args:
+            start: The start.
+            steps: The steps: records of :mod:`apex_ompl.scene`, or entries of ``after`` in problem files. The goal of a
+                ``move`` may be any goal of :meth:`plan`.
+            planner: A planner; see :func:`apex_ompl.plan`.
+            name: Name of the problem in the result.
+            search: How goals are chosen.
+            **options: As of :meth:`plan`, ``group`` among them; ``timeout`` is for the whole sequence.
+
+        Raises:
+            ApexError: The start, a step, the planner, a parameter or the name of an option is faulty.
+            KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
+        """
+        from apex_ompl.planning.task_problem import sequence_problem
+
+        check_options(options, OPTIONS)
+        with running(), self._lock:
+            self._check_nothing_moves()
+            problem = sequence_problem(self.robot, self.problem(start, start, name), steps)
+            return self._plan_task(problem, planner, search, options)
+
     def plan_task(
-        self, problem: Problem, planner: AnyPlanner | None = None, **options: Unpack[ProblemKeywords]
-    ) -> TaskResult:
+        self, problem: Problem, planner: AnyPlanner | None = None, search: TaskSearch | None = None,
+        **options: Unpack[ProblemKeywords],
+    ) -> TaskResult:  # fmt: skip
         """Put the bodies of a problem into the world, and plan to its goal and the steps after it.
 
         The world is then that on the way to the goal.
@@ -172,6 +205,7 @@ class MotionPlanner:
         Args:
             problem: A problem of this robot.
             planner: A planner; see :func:`apex_ompl.plan`.
+            search: How goals are chosen.
             **options: As of :meth:`plan`, ``group`` among them; ``timeout`` is for the whole task.
 
         Raises:
@@ -180,18 +214,23 @@ class MotionPlanner:
         check_options(options, OPTIONS)
         with running(), self._lock:
             with unforked():
-                from apex_ompl.planning.tasks import plan_task
-                from apex_ompl.scene.problem import with_lines
-
-                problem = with_lines(problem)
                 self.world.load(problem)
-            given = PlanOptions(**options)
+            return self._plan_task(problem, planner, search, options)
 
-            def plan_to(goals: Problem, timeout: float, first: bool) -> PlanResult:
-                now = given if first else given.from_rest()
-                return self._plan(goals, planner, time.perf_counter(), replace(now, timeout=timeout))
+    def _plan_task(
+        self, problem: Problem, planner: AnyPlanner | None, search: TaskSearch | None, options: ProblemKeywords
+    ) -> TaskResult:
+        """Plan a task whose bodies are in the world, while the lock is held."""
+        with unforked():
+            from apex_ompl.planning.task_problem import with_lines
+            from apex_ompl.planning.tasks import plan_task
+        given = PlanOptions(**options)
 
-            return plan_task(self._checker, problem, given, plan_to)
+        def plan_to(goals: Problem, timeout: float, first: bool, group: Group | None) -> PlanResult:
+            now = replace(given if first else given.from_rest(), timeout=timeout, group=group)
+            return self._plan(goals, planner, time.perf_counter(), now)
+
+        return plan_task(self._checker, with_lines(problem), given, plan_to, search)
 
     def _plan(
         self, problem: Problem, planner: AnyPlanner | None, started: float, options: PlanOptions
@@ -556,7 +595,9 @@ def _check_is_no_line(problem: Problem) -> None:
         ParameterError: It has one.
     """
     for frame, approach in problem.goal.approaches.items():
-        raise ParameterError("goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task")
+        raise ParameterError(
+            "goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task (apex-ompl sequence)"
+        )
 
 
 def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:

@@ -54,6 +54,7 @@ class TaskStep:
         released: Objects that its hand lets go of.
         grasped: Objects that its hand takes.
         gone: Released objects that planning no longer knows of from its end on, since they fall.
+        blended: Whether the next step starts without a rest in between; ``end`` is in the middle of the blend then.
     """
 
     kind: str
@@ -70,6 +71,7 @@ class TaskStep:
     released: tuple[str, ...] = ()
     grasped: tuple[str, ...] = ()
     gone: tuple[str, ...] = ()
+    blended: bool = False
 
     def __repr__(self) -> str:
         """Return the title, the times, and what changes at the end."""
@@ -95,7 +97,8 @@ class TaskStep:
         return {
             "kind": self.kind, "title": self.title, "start": _number(self.start), "end": _number(self.end),
             "clearance": _number(self.clearance), "left": _number(self.left), "released": list(self.released),
-            "grasped": list(self.grasped), "gone": list(self.gone), "path": self.path.states.tolist(),
+            "grasped": list(self.grasped), "gone": list(self.gone), "blended": self.blended,
+            "path": self.path.states.tolist(),
             "scene": [_plain(one) for one in changed], "removed": removed,
             "attached": [_plain(one) for one in self.attached], "allowed": [list(pair) for pair in self.allowed],
             "leaving": [list(pair) for pair in self.leaving],
@@ -116,7 +119,7 @@ class TaskStep:
         return cls(
             kind=str(data["kind"]), title=str(data["title"]), path=Path(finite_array(data["path"], "path")),
             scene=tuple(scene.values()), attached=bodies.attached, allowed=bodies.allowed,
-            leaving=bodies.leaving,
+            leaving=bodies.leaving, blended=bool(data["blended"]),
             **{name: tuple(map(str, data[name])) for name in ("released", "grasped", "gone")},  # type: ignore[arg-type]
             **{n: nan if data[n] is None else float(data[n]) for n in ("start", "end", "clearance", "left")},  # type: ignore[arg-type]
         )  # fmt: skip

@@ -5,54 +5,49 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import nan
+from math import isnan, nan
 
-import coal
 import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import coal_geometry, world_geometry
-from apex_ompl.constraints.frames import frame_of
 from apex_ompl.constraints.line import SAME_POINT
 from apex_ompl.errors import SceneError, TimingError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
-from apex_ompl.planning.line_query import line_query
+from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
+from apex_ompl.planning.superposition import abreast, superposed
 from apex_ompl.planning.task_constraints import StepConstraints
+from apex_ompl.planning.task_waypoints import StepFailed, held_pose, waypoints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep, WaitStep
+from apex_ompl.scene.steps import (
+    AllowStep,
+    AttachStep,
+    DetachStep,
+    GraspStep,
+    HandStep,
+    LineStep,
+    ReleaseStep,
+    RetreatStep,
+    TogetherStep,
+    TurnStep,
+    WaitStep,
+)
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
 from apex_ompl.util.clocks import Deadline
 
-NEAR = 1e-5  # of a share of a line at which the search for its end stops [m]
-MOST_ADVANCES = 500
-ARC = np.radians(5.0)  # of a turn that a straight line replaces [rad]
 LATE = "the time is over"
 BLEND = 0.4  # of the way between two poses of a turn
 HAND_ROOM = 1e-4  # to the limits of a synergy, which motions at another rate need at rests
 DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
 EXAMINED = 50  # states at which that is examined
-
-
-class StepFailed(Exception):  # noqa: N818 - an outcome, not an error
-    """A step that cannot be done from a state.
-
-    Attributes:
-        cause: The reason without the numbers of this state, by which failures are counted.
-    """
-
-    def __init__(self, reason: str, cause: str = "") -> None:
-        """Give the reason, and the cause if it is another text."""
-        super().__init__(reason)
-        self.cause = cause or reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,107 +151,42 @@ class StepPlanner:
         """
         if isinstance(step, WaitStep):
             return self._wait(world, step, q, timing)
-        if isinstance(step, LineStep):
-            return self._line(world, step, q, [self._poses(world, step, q)], timing)
-        if isinstance(step, TurnStep):
-            return self._line(world, step, q, self._turned(world, step, q), timing)
         if isinstance(step, RetreatStep):
             return self._retreat(world, step, q, timing)
+        if isinstance(step, LineStep | TurnStep):
+            return self._line(world, step, q, timing)
+        if isinstance(step, TogetherStep):
+            return self._together(world, step, q, timing)
+        if isinstance(step, AttachStep | DetachStep | AllowStep):
+            during = world if isinstance(step, DetachStep) else world.after(step, q)
+            return self._proved(StepPlan(step, during, world.after(step, q), Path(q[None]), None, nan), timing)
         assert not isinstance(step, MoveStep)
         return self._hand(world, step, q, timing)
 
-    def _become(self, world: TaskWorld, pairs: frozenset[tuple[str, str]] | None = None) -> None:
+    def become(self, world: TaskWorld, pairs: frozenset[tuple[str, str]] | None = None) -> None:
+        """Put the bodies of a world into the checker, with other pairs that may touch if they are given."""
         self.checker.become(world.scene, world.held, world.pairs if pairs is None else pairs)
 
-    def _poses(self, world: TaskWorld, step: LineStep, q: Array) -> dict[str, Array]:
-        """Return the poses of the frames at the end of a line, shape (4, 4) each."""
-        frames = {name: frame_of(self.robot, name, world.held) for name in step.frame}
-        poses = {name: self.robot.link_pose(q, frame.link) @ frame.pose for name, frame in frames.items()}
-        if step.onto is not None:
-            name = step.frame[0]
-            return {name: self._aligned(world, step, q, poses[name])}
-        assert step.by is not None
-        moves = {
-            name: np.array(step.by) if step.axes == "world" else pose[:3, :3] @ np.array(step.by)
-            for name, pose in poses.items()
-        }
-        share = 1.0 if step.gap is None else self._share(world, moves, step.gap, q)
-        for name, pose in poses.items():
-            pose[:3, 3] += share * moves[name]
-        return poses
-
-    def _aligned(self, world: TaskWorld, step: LineStep, q: Array, pose: Array) -> Array:
-        """Return the pose of a frame in which its contact face is aligned with another one."""
-        assert step.onto is not None and step.distance is not None
-        moved, fixed = world.face(step.frame[0], q), world.face(step.onto, q)
-        assert moved is not None and fixed is not None
-        turn = pin.Quaternion.FromTwoVectors(moved[1], -fixed[1]).matrix()
-        made = np.eye(4)
-        made[:3, :3] = turn @ pose[:3, :3]
-        made[:3, 3] = turn @ (pose[:3, 3] - moved[0]) + fixed[0] + step.distance * fixed[1]
-        return made
-
-    def _turned(self, world: TaskWorld, step: TurnStep, q: Array) -> list[dict[str, Array]]:
-        """Return the poses of frames along a turn about the origin of the first, a few degrees apart."""
-        poses = {}
-        for name in step.frame:
-            frame = frame_of(self.robot, name, world.held)
-            poses[name] = self.robot.link_pose(q, frame.link) @ frame.pose
-        first = poses[step.frame[0]]
-        to = np.asarray(step.to, float) / length(step.to)
-        turn = pin.AngleAxis(pin.Quaternion.FromTwoVectors(first[:3, 2], to))
-        count = max(1, int(np.ceil(turn.angle / ARC))) if len(poses) > 1 else 1  # its own origin needs no arc
-        found = []
-        for k in range(1, count + 1):
-            part = np.eye(4)
-            part[:3, :3] = pin.AngleAxis(turn.angle * k / count, turn.axis).toRotationMatrix()
-            part[:3, 3] = first[:3, 3] - part[:3, :3] @ first[:3, 3]
-            found.append({name: part @ pose for name, pose in poses.items()})
-        return found
-
-    def _share(self, world: TaskWorld, moves: Mapping[str, Array], gap: float, q: Array) -> float:
-        """Return the share of displacements after which a moved object is at a gap from another body, 1 at most.
-
-        Conservative advancement: a body that is d away is not reached before the displacement is that long.
+    def line_query(
+        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
+    ) -> LineQuery:
+        """Return what a step along straight lines is about; the checker has the bodies of its world then.
 
         Raises:
-            StepFailed: It is nearer than that at the start.
+            StepFailed: A held object is nearer to another body than the gap of the line.
         """
-        others = [world_geometry(body) for body in (*self.robot.fixtures, *world.scene.values())]
-        along = {world.held[name].link for name in moves}  # what these links hold moves along
-        others += [(coal_geometry(o), self._pose(world, n, q)) for n, o in world.held.items() if o.link not in along]
-        least, request = 1.0, coal.DistanceRequest()
-        for name, move in moves.items():
-            shape, start, share, size = coal_geometry(world.held[name]), self._pose(world, name, q), 0.0, length(move)
-            for _ in range(MOST_ADVANCES if others else 0):
-                placed = _transform(start, share * move)
-                away = min(
-                    coal.distance(shape, placed, other, _transform(pose), request, coal.DistanceResult())
-                    for other, pose in others
-                )
-                if share == 0.0 and away < gap:
-                    raise StepFailed(f"{name} is {1e3 * away:.3g} mm from another body at its start, less than the gap")
-                if away - gap < NEAR or share >= least:
-                    break
-                share += (away - gap) / size
-            least = min(least, share) if others else least
-        return least
-
-    def _pose(self, world: TaskWorld, name: str, q: Array) -> Array:
-        """Return the pose of a held object in the world, shape (4, 4)."""
-        one = world.held[name]
-        return self.robot.link_pose(q, one.link) @ one.pose
+        poses = waypoints(world, step, q)
+        self.become(world)
+        return line_query(
+            self.checker, q, list(poses), frame=None, blend=_blend(poses), speed=step.speed,
+            timing=False if timing is None else timing_in(world, timing), problem=lambda goals: self.problem,
+        )  # fmt: skip
 
     def _line(
-        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, poses: Sequence[Mapping[str, Array]],
-        timing: Timing | None,
-    ) -> StepPlan:  # fmt: skip
+        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
+    ) -> StepPlan:
         """Return straight lines from poses of frames to poses, with blends between them."""
-        self._become(world)
-        query = line_query(
-            self.checker, q, list(poses), frame=None, blend=_blend(poses), speed=step.speed,
-            timing=False if timing is None else _timing_in(world, timing), problem=lambda goals: self.problem,
-        )  # fmt: skip
+        query = self.line_query(world, step, q, timing)
         found = plan_along(self.checker, query, self._deadline, self._ends)
         if not found or found.path is None:
             raise StepFailed(found.reason, " ".join((f"{found.end}", *found.blocked_by)))
@@ -275,24 +205,66 @@ class StepPlanner:
         self, world: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array, timing: Timing | None
     ) -> StepPlan:
         """Return a hand that opens or closes."""
-        synergy, during = self.robot.hands[step.hand].synergy, world
-        to = step.to
-        if isinstance(step, GraspStep):
-            during = world.grasped(step, q)
-            if to is None and synergy is not None:
-                to = self._closed(during, step, q)
-        end = q.copy()
+        during = world.grasped(step, q) if isinstance(step, GraspStep) else world
+        end = self.hand_end(during, step, q)
+        states = np.stack([q, end]) if (end != q).any() else q[None]
+        return self._proved(StepPlan(step, during, world.after(step, end), Path(states), None, nan), timing)
+
+    def hand_end(self, during: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array) -> Array:
+        """Return the state after a hand has opened or closed, shape (dof,).
+
+        Raises:
+            StepFailed: The open hand is in contact with what it is to hold.
+        """
+        synergy, to, end = self.robot.hands[step.hand].synergy, step.to, q.copy()
+        if isinstance(step, GraspStep) and to is None and synergy is not None:
+            to = self._closed(during, step, q)
         if synergy is not None and to is not None:
             k, limits = self.robot.joint_names.index(synergy), self.robot.limits
             wanted = float(np.clip(to, limits.lower[k] + HAND_ROOM, limits.upper[k] - HAND_ROOM))
             end[k] = q[k] if abs(wanted - q[k]) <= HAND_ROOM else wanted
-        states = np.stack([q, end]) if (end != q).any() else q[None]
-        self._become(during)
-        check = full_check(self.checker, states, q, [end], deadline=self._deadline.at)
+        return end
+
+    def _proved(self, plan: StepPlan, timing: Timing | None) -> StepPlan:
+        """Return a step with its clearance and its motion.
+
+        Raises:
+            StepFailed: It is not free, or not timed in time.
+        """
+        states = plan.path.states
+        self.become(plan.world)
+        check = full_check(self.checker, states, states[0], [states[-1]], deadline=self._deadline.at)
         if not check or check.proof is None:
             raise StepFailed(LATE if check.timed_out else check.reason)
-        found = StepPlan(step, during, world.after(step, end), Path(states), None, check.proof.clearance)
-        return found if timing is None else self._timed(found, timing)
+        plan = replace(plan, clearance=check.proof.clearance)
+        return plan if timing is None else self._timed(plan, timing)
+
+    def _together(self, world: TaskWorld, step: TogetherStep, q: Array, timing: Timing | None) -> StepPlan:
+        """Return steps that start at once, each planned while the others rest, and proved together."""
+        plans = [self.plan(world, one, q, timing) for one in step.steps]
+        columns = [set(np.flatnonzero((plan.path.states != q).any(axis=0)).tolist()) for plan in plans]
+        shared = [k for k in range(len(q)) if sum(k in moved for moved in columns) > 1]
+        if shared:
+            raise StepFailed(f"two of them move {self.robot.joint_names[shared[0]]}")
+        during, after, end = world, world, q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
+        for one in step.steps:
+            during = during.after(one, q) if isinstance(one, GraspStep | AttachStep) else during
+            after = after.after(one, end)
+        motions = [plan.motion for plan in plans if plan.motion is not None]
+        motion = superposed([(one, 0.0) for one in motions]) if len(motions) == len(plans) else None
+        path = Path(abreast([plan.path.states for plan in plans]))
+        self.become(during)
+        check = full_check(self.checker, path.states if motion is None else motion, deadline=self._deadline.at)
+        if not check or check.proof is None:
+            raise StepFailed(LATE if check.timed_out else check.reason)
+        lefts, use = [plan.left for plan in plans if not isnan(plan.left)], dict[str, float]()
+        for plan in plans:
+            use = {name: max(use.get(name, 0.0), share) for name, share in (use | dict(plan.use)).items()}
+        left = nan if not lefts else max(lefts) if motion is not None else float(len(path.states) - 1)
+        return StepPlan(
+            step, during, after, path, motion, check.proof.clearance, left, use,
+            max(plan.deviation for plan in plans),
+        )  # fmt: skip
 
     def _closed(self, during: TaskWorld, step: GraspStep, q: Array) -> float:
         """Return the synergy at which a hand is just before contact with its object.
@@ -301,7 +273,7 @@ class StepPlanner:
             StepFailed: The open hand is in contact with it.
         """
         one, palm = during.held[step.object], self.robot.hands[step.hand].palm
-        pose = np.linalg.inv(self.robot.link_pose(q, palm)) @ self._pose(during, step.object, q)
+        pose = np.linalg.inv(self.robot.link_pose(q, palm)) @ held_pose(during, step.object, q)
         turn = pin.Quaternion(pose[:3, :3]).coeffs()
         placed = one.model_copy(
             update={"position": tuple(pose[:3, 3]), "orientation": tuple(turn), "links": None, "link": palm}
@@ -319,7 +291,7 @@ class StepPlanner:
             StepFailed: There is none in time.
         """
         world, states, limits = plan.world, plan.path.states, self.robot.limits
-        how, clear = _timing_in(world, timing), [nan]
+        how, clear = timing_in(world, timing), [nan]
         scaled = how.limits(limits, self.robot.joint_names)
         more = how.motion_limits(self.robot, tuple(world.held.values()), self.problem.payload)
 
@@ -341,30 +313,22 @@ class StepPlanner:
 
     def _wait(self, world: TaskWorld, step: WaitStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a rest."""
-        self._become(world)
-        states, motion = q[None], None
-        check = full_check(self.checker, states, q, deadline=self._deadline.at)
-        if not check or check.proof is None:
-            raise StepFailed(LATE if check.timed_out else check.reason)
-        if timing is not None:
-            still = np.zeros((2, len(q)))
-            motion = Trajectory(
-                np.array([0.0, step.seconds]), np.stack([q, q]), still, still.copy(), self.robot.joint_names
-            )
-        return StepPlan(step, world, world, Path(states), motion, check.proof.clearance)
+        found = self._proved(StepPlan(step, world, world, Path(q[None]), None, nan), None)
+        if timing is None:
+            return found
+        still = np.zeros((2, len(q)))
+        motion = Trajectory(
+            np.array([0.0, step.seconds]), np.stack([q, q]), still, still.copy(), self.robot.joint_names
+        )
+        return replace(found, motion=motion)
 
     def _retreat(self, world: TaskWorld, step: RetreatStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a hand's way from what it released, which it may touch on the first part of the way only."""
-        hand = self.robot.hands[step.hand]
-        frame = frame_of(self.robot, step.hand, world.held)
-        pose = self.robot.link_pose(q, frame.link) @ frame.pose
-        direction = -np.asarray(hand.axis, float) if step.direction is None else np.asarray(step.direction, float)
-        pose[:3, 3] += step.distance / length(direction) * (pose[:3, :3] @ direction)
-        found = self._line(world, step, q, [{step.hand: pose}], timing)
+        found = self._line(world, step, q, timing)
         pairs = world.leaving_pairs(step.hand)
         if not pairs:
             return replace(found, left=0.0)
-        self._become(world, world.pairs - pairs)
+        self.become(world, world.pairs - pairs)
         left, clearance = self._left(found, step, world)
         self._check_depths(found, left, pairs)
         return replace(found, left=left, clearance=min(clearance, found.clearance))
@@ -433,15 +397,10 @@ def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
     return BLEND * min((way for way in ways if way > SAME_POINT), default=0.0)
 
 
-def _timing_in(world: TaskWorld, timing: Timing) -> Timing:
+def timing_in(world: TaskWorld, timing: Timing) -> Timing:
     """Return a timing of a step: from rest, and without tools that are not held then."""
     speeds = timing.max_tool_speed
     if isinstance(speeds, Mapping):
         known = {*world.held, *world.robot.hands, *world.robot.link_names}
         speeds = {name: speed for name, speed in speeds.items() if name in known} or None
     return replace(timing, minimum_duration=0.0, start_velocity=(), start_acceleration=(), max_tool_speed=speeds)
-
-
-def _transform(pose: Array, move: Array | float = 0.0) -> coal.Transform3s:
-    """Return a pose, shape (4, 4), moved by a displacement in the world, shape (3,), for Coal."""
-    return coal.Transform3s(pose[:3, :3], pose[:3, 3] + move)

@@ -6,7 +6,7 @@ is planned (:func:`check_steps`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,14 +18,25 @@ from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.planning.line_query import tools_of
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
-from apex_ompl.scene.bodies import MOTION, AttachedObject, ContactFace, Obstacle, given_fields, pose_fields
+from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TurnStep
+from apex_ompl.scene.steps import (
+    AllowStep,
+    AttachStep,
+    DetachStep,
+    GraspStep,
+    HandStep,
+    LineStep,
+    ReleaseStep,
+    RetreatStep,
+    TogetherStep,
+    TurnStep,
+)
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 
 Pair = tuple[str, str]
-HELD = ("link", "links", "touch_links", "contact")  # fields that an object has only while it is held
+HELD = ("link", "links", "touch_links")  # fields that an object has only while it is held
 
 
 @dataclass(frozen=True)
@@ -38,7 +49,6 @@ class TaskWorld:
         held: Held objects by name.
         allowed: Pairs of bodies that may touch.
         leaving: Hand -> objects that it released and may still touch.
-        faces: Contact faces of released objects by name.
     """
 
     robot: Robot
@@ -46,7 +56,6 @@ class TaskWorld:
     held: Mapping[str, AttachedObject]
     allowed: frozenset[Pair]
     leaving: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    faces: Mapping[str, ContactFace] = field(default_factory=dict)
 
     @classmethod
     def of(cls, robot: Robot, problem: Problem) -> TaskWorld:
@@ -74,11 +83,14 @@ class TaskWorld:
         """Return center and outward axis of a contact face in the world, shape (3,) each, or None where there is none.
 
         Args:
-            name: A hand, a held object, or one that was released.
+            name: A hand, an obstacle or a held object.
             q: State, shape (dof,).
         """
-        if name in self.scene and name in self.faces:
-            pose, face = self.scene[name].pose, self.faces[name]
+        standing = self.scene.get(name)
+        if standing is not None:
+            pose, face = standing.pose, standing.contact
+            if face is None:
+                return None
             axis = pose[:3, :3] @ np.asarray(face.axis, float)
             return pose[:3, :3] @ np.asarray(face.point, float) + pose[:3, 3], axis / np.linalg.norm(axis)
         if name in self.robot.hands:
@@ -115,50 +127,76 @@ class TaskWorld:
         """
         if isinstance(step, ReleaseStep):
             return self._released(step, q)
-        if isinstance(step, GraspStep):
+        if isinstance(step, DetachStep):
+            return self._let_go((step.object,), self.holder(step.object), False, q)
+        if isinstance(step, AllowStep):
+            pairs = {_pair(*pair) for pair in step.pairs}
+            rest = {pair for pair in self.allowed if _pair(*pair) not in pairs}
+            return replace(self, allowed=frozenset(rest | pairs if step.contact else rest))
+        if isinstance(step, TogetherStep):
+            world = self
+            for one in step.steps:
+                world = world.after(one, q)
+            return world
+        if isinstance(step, GraspStep | AttachStep):
             return self.grasped(step, q)
         if isinstance(step, RetreatStep):
             return replace(self, leaving={hand: names for hand, names in self.leaving.items() if hand != step.hand})
         return self
 
     def _released(self, step: ReleaseStep, q: Array) -> TaskWorld:
-        mine = self.held_by(step.hand)
-        scene, held, faces, gone = dict(self.scene), dict(self.held), dict(self.faces), set[str]()
-        names = mine if step.objects is None else step.objects
+        names = self.held_by(step.hand) if step.objects is None else step.objects
+        return self._let_go(names, step.hand, step.falls, q)
+
+    def holder(self, name: str) -> str | None:
+        """Return the hand that holds an object, or None where it is fixed to another link."""
+        hands = (hand for hand in self.robot.hands if self.held[name].link in hand_links(self.robot, hand))
+        return next(hands, None)
+
+    def _let_go(self, names: Sequence[str], hand: str | None, falls: bool, q: Array) -> TaskWorld:
+        """Return the world without objects in a hand, or at the link that they are fixed to."""
+        scene, held, gone = dict(self.scene), dict(self.held), set[str]()
         for name in names:
             one = held.pop(name)
             pose = self.robot.link_pose(q, one.link) @ one.pose
-            others = [link for link in one.holders if link not in hand_links(self.robot, step.hand)]
+            mine = (one.link,) if hand is None else hand_links(self.robot, hand)
+            others = [link for link in one.holders if link not in mine]
             if others:
                 inside = np.linalg.inv(self.robot.link_pose(q, others[0])) @ pose
                 fields: dict[str, Any] = given_fields(one, ("link", "links", "touch_links"))
                 held[name] = _read(AttachedObject, {**fields, "link": others[0], **pose_fields(inside)})
-            elif step.falls:
+            elif falls:
                 gone.add(name)
             else:
                 scene[name] = _read(Obstacle, {**given_fields(one, HELD), **pose_fields(pose)})
-                if one.contact is not None:
-                    faces[name] = one.contact
-        left = (*self.leaving.get(step.hand, ()), *(name for name in names if name not in gone))
         allowed = frozenset(pair for pair in self.allowed if not gone & {*pair})
-        leaving = {**self.leaving, step.hand: left} if left else self.leaving
-        return replace(self, scene=scene, held=held, faces=faces, allowed=allowed, leaving=leaving)
+        leaving = self.leaving
+        if hand is not None:
+            left = (*self.leaving.get(hand, ()), *(name for name in names if name not in gone))
+            leaving = {**self.leaving, hand: left} if left else self.leaving
+        return replace(self, scene=scene, held=held, allowed=allowed, leaving=leaving)
 
-    def grasped(self, step: GraspStep, q: Array) -> TaskWorld:
-        """Return the world in which the hand of a step holds its object, taken where it is at a state, shape (dof,)."""
-        palm, name = self.robot.hands[step.hand].palm, step.object
-        scene, held, faces = dict(self.scene), dict(self.held), dict(self.faces)
+    def grasped(self, step: GraspStep | AttachStep, q: Array) -> TaskWorld:
+        """Return the world in which the object of a step is held, taken where it is at a state, shape (dof,)."""
+        name, taker = step.object, step.hand if isinstance(step, GraspStep) else step.link
+        link = self.robot.hands[taker].palm if taker in self.robot.hands else taker
+        scene, held = dict(self.scene), dict(self.held)
         if name in held:
             one = held[name]
             fields: dict[str, Any] = given_fields(one, ("links", "touch_links"))
-            held[name] = _read(AttachedObject, {**fields, "links": (one.link, palm)})
+            held[name] = _read(AttachedObject, {**fields, "links": (one.link, link)})
         else:
-            obstacle, face = scene.pop(name), faces.pop(name, None)
-            pose = np.linalg.inv(self.robot.link_pose(q, palm)) @ obstacle.pose
-            fields = {**given_fields(obstacle, MOTION), "link": palm, **pose_fields(pose)}
-            held[name] = _read(AttachedObject, fields | ({} if face is None else {"contact": face}))
+            obstacle = scene.pop(name)
+            pose = np.linalg.inv(self.robot.link_pose(q, link)) @ obstacle.pose
+            fields = {**given_fields(obstacle, MOTION), "link": link, **pose_fields(pose)}
+            held[name] = _read(AttachedObject, fields)
         leaving = {hand: tuple(n for n in names if n != name) for hand, names in self.leaving.items()}
-        return replace(self, scene=scene, held=held, faces=faces, leaving={h: n for h, n in leaving.items() if n})
+        return replace(self, scene=scene, held=held, leaving={h: n for h, n in leaving.items() if n})
+
+
+def _pair(first: str, second: str) -> Pair:
+    """Return two names in alphabetical order."""
+    return (first, second) if first <= second else (second, first)
 
 
 def hand_links(robot: Robot, hand: str) -> tuple[str, ...]:
@@ -197,8 +235,33 @@ def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]
     """Yield field, value and what was expected, for each fault of a step."""
     if isinstance(step, LineStep | TurnStep):
         yield from _frame_faults(world, step)
+    elif isinstance(step, TogetherStep):
+        for k, one in enumerate(step.steps):
+            yield from ((f"steps.{k}.{name}", value, expected) for name, value, expected in _faults(world, one))
+    elif isinstance(step, AttachStep | DetachStep | AllowStep):
+        yield from _body_faults(world, step)
     elif isinstance(step, HandStep | ReleaseStep | GraspStep | RetreatStep):
         yield from _hand_faults(world, step)
+
+
+def _body_faults(world: TaskWorld, step: AttachStep | DetachStep | AllowStep) -> Iterable[tuple[str, object, str]]:
+    if isinstance(step, AttachStep):
+        if step.object not in world.scene:
+            yield "object", step.object, f"expected an obstacle: {', '.join(world.scene) or 'there is none'}"
+        elif world.scene[step.object].half_space is not None or world.scene[step.object].points is not None:
+            yield "object", step.object, "expected a solid that can be held"
+        if step.link not in (*world.robot.hands, *world.robot.link_names):
+            yield "link", step.link, "expected a hand or a link of the robot"
+    elif isinstance(step, DetachStep):
+        if step.object not in world.held:
+            yield "object", step.object, f"expected a held object: {', '.join(world.held) or 'there is none'}"
+    elif isinstance(step, AllowStep):
+        fixtures = [body.name for body in world.robot.fixtures]
+        known = (*world.robot.link_names, *world.held, *world.scene, *fixtures)
+        for name in (name for pair in step.pairs for name in pair):
+            if name not in known:
+                named = ", ".join((*world.held, *world.scene, *fixtures))
+                yield "pairs", name, f"expected links of the robot, or: {named or 'there is no object'}"
 
 
 def _hand_faults(

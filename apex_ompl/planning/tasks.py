@@ -1,79 +1,83 @@
-"""Plans of whole tasks: a goal from which the steps after it can be done, a motion there, and these steps.
+"""Plans of whole tasks, sequences of motions and steps: choices of goals that make the later steps possible.
 
-Goals are examined first, the nearest first: from each, the steps after the goal are planned without timing. The planner
-then plans to those from which all of them can be done. So a goal whose continuation fails is never chosen, and the
-reasons for which goals were rejected are counted.
+A goal is chosen by a rehearsal of the steps and goals after it (:mod:`apex_ompl.planning.task_rehearsal`). Then the
+motion to it and the steps up to the next motion are planned and proved, and so on. Where one fails, the next choice is
+tried, first of the last motion, then of the one before it; the reasons are counted.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
-from math import isnan, nan
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.ompl.process import Interrupt, quiet_ompl
-from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
-from apex_ompl.ompl.validity import full_check
+from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, state_fault
 from apex_ompl.planning.options import PlanOptions
+from apex_ompl.planning.query import Group
 from apex_ompl.planning.steps import assemble, query_fault
-from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
-from apex_ompl.planning.task_steps import StepFailed, StepPlan, StepPlanner
+from apex_ompl.planning.task_goals import TaskGoal, task_goal
+from apex_ompl.planning.task_motion import whole
+from apex_ompl.planning.task_rehearsal import Rehearsal
+from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.planning.task_steps import StepPlan, StepPlanner
+from apex_ompl.planning.task_waypoints import StepFailed
 from apex_ompl.planning.task_world import TaskWorld, check_steps
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.model import digest
 from apex_ompl.robot.rest_to_rest import direct_durations
-from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, ReleaseStep, RetreatStep
-from apex_ompl.timing import Timing, Trajectory
-from apex_ompl.timing.trajectory import joined
+from apex_ompl.scene.problem import Goal, Problem
+from apex_ompl.timing import Timing
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.process import running
 
-WANTED = 3  # goals from which all steps can be done, among which the planner chooses
-EXAMINATION = 0.5  # of the time, at most, for the search for these goals once one is found
-PER_GOAL = 0.5  # of the timeout, for the steps from one goal
+EXAMINATION = 0.5  # of the time, at most, for the search for goals of a motion once one is found
 ROUNDS = 7  # of sampling goals, after those of the set-up
+ALTERNATIVES = 64  # states of goals of which any will do that follow those of the set-up
+MOST_FAILURES = 2  # of one grasp, or another goal of several, after which it is left out of quick rehearsals
+THOROUGH = 12  # goals that are rehearsed thoroughly where a quick rehearsal rejects all
+MOTION_SHARE = 0.4  # of the time left, for a motion where other choices or further motions follow
 MOST_CAUSES = 3  # that a reason names
 WORDS = "no goal was found from which the steps after it can be done"
 
-PlanTo = Callable[[Problem, float, bool], PlanResult]
-"""Plans a problem in a time [s]; with True the first motion of the task, which alone has constraints along it."""
+PlanTo = Callable[[Problem, float, bool, Group | None], PlanResult]
+"""Plans a problem in a time [s], for joints or all; with True the first motion of the task, which alone has constraints
+along it."""
 
 
-class Stage(NamedTuple):
-    """A motion to a goal, and the steps after it up to the next such motion.
+@dataclass(frozen=True)
+class TaskSearch:
+    """How goals of a task are chosen.
 
     Attributes:
-        move: The motion; its goal is that of the problem for the first one.
-        steps: The steps.
+        goes_back: Whether the steps after a goal are rehearsed before it is chosen, and other choices tried where a
+            step fails. Otherwise the nearest goal of each motion is taken, and the task fails where it does not suit.
+        wanted: Goals of the last motion among which the planner chooses.
     """
 
-    move: MoveStep
-    steps: tuple[AnyStep, ...]
+    goes_back: bool = True
+    wanted: int = 3
 
 
-def stages(problem: Problem) -> list[Stage]:
-    """Return the stages of a task."""
-    found = [Stage(MoveStep(goal=problem.goal), ())]
-    for step in problem.after:
-        if isinstance(step, MoveStep):
-            found.append(Stage(step, ()))
-        else:
-            found[-1] = found[-1]._replace(steps=(*found[-1].steps, step))
-    return found
+class _Choice(NamedTuple):
+    """A goal, and goals of the later motions that were rehearsed from it."""
+
+    goal: Array
+    later: list[Array]
 
 
-def plan_task(checker: CollisionChecker, problem: Problem, options: PlanOptions, plan_to: PlanTo) -> TaskResult:
+def plan_task(
+    checker: CollisionChecker, problem: Problem, options: PlanOptions, plan_to: PlanTo, search: TaskSearch | None = None
+) -> TaskResult:
     """Return the plan of a whole task: what :meth:`apex_ompl.MotionPlanner.plan_task` returns.
 
     Args:
@@ -81,6 +85,7 @@ def plan_task(checker: CollisionChecker, problem: Problem, options: PlanOptions,
         problem: The problem.
         options: The options of the plan.
         plan_to: Plans from goal to goal.
+        search: How goals are chosen.
 
     Raises:
         ApexError: The problem, a step or an option is faulty.
@@ -88,7 +93,7 @@ def plan_task(checker: CollisionChecker, problem: Problem, options: PlanOptions,
     """
     options.check()
     check_steps(checker.robot, problem)
-    task = TaskPlanner(checker, problem, options, plan_to)
+    task = TaskPlanner(checker, problem, options, plan_to, search or TaskSearch())
     try:
         return task.plan()
     finally:
@@ -100,23 +105,27 @@ class TaskPlanner:
 
     Attributes:
         world: The world on the way to the goal.
-        rejected: Why steps after a goal could not be done -> number of goals.
+        rejected: Why a goal could not be chosen, or a step not done -> number of goals.
         examined: Number of goals from which the steps were tried.
     """
 
     def __init__(
-        self, checker: CollisionChecker, problem: Problem, options: PlanOptions, plan_to: PlanTo
-    ) -> None:  # fmt: skip
+        self, checker: CollisionChecker, problem: Problem, options: PlanOptions, plan_to: PlanTo, search: TaskSearch
+    ) -> None:
         """Plan the task of a problem; see :func:`plan_task`."""
         self._checker, self._problem, self._options, self._plan_to = checker, problem, options, plan_to
+        self._search = search
         self._timing = Timing() if options.timing is True else options.timing or None
         self._deadline, self._interrupt = Deadline(options.timeout), Interrupt()
-        self._stages, self._times = stages(problem), {"steps": 0.0}
+        self._times = {"steps": 0.0}
         self.world = TaskWorld.of(checker.robot, problem)
         self.rejected, self.examined = Counter[str](), 0
         bodies = self.world.scene.values(), self.world.held.values(), self.world.allowed
         mine = CollisionChecker(checker.robot, *bodies)
         self._steps = StepPlanner(mine, problem, self._deadline, lambda: self._interrupt.pressed)
+        self._rehearsal = Rehearsal(self._steps, options.seed, self._ends)
+        self._stages = self._rehearsal.stages
+        self._first: PlanResult | None = None
 
     def plan(self) -> TaskResult:
         """Return the plan of the whole task."""
@@ -129,126 +138,192 @@ class TaskPlanner:
         fault = query_fault(setup)[0]
         leaves = given.leave_contact and setup.start_fault
         if fault is not None and not leaves:
-            return TaskResult.of(self._plan_to(self._problem, given.timeout, True))
+            return TaskResult.of(self._plan_to(self._problem, given.timeout, True, given.group))
         try:
-            found, plans = self._solved(0, self.world, setup)
+            plans = self._solved(0, self.world, setup.start, [], setup)
         except NotPlannedError as failure:
-            return self._said(TaskResult.of(failure.result))
+            return self._reported(TaskResult.of(failure.result))
         except StepFailed as failure:
             return self._failed(str(failure))
-        return self._said(_whole(found, plans, self._checker.robot, self._problem))
+        assert self._first is not None
+        with self._interruptible():
+            return self._reported(whole(self._steps, self._first, plans, self._problem, self._timing))
 
-    def _solved(self, k: int, world: TaskWorld, setup: PlanningSetup) -> tuple[PlanResult, list[StepPlan]]:
-        """Return the plan to the goal of a stage, and those of all steps after it.
+    def _ends(self) -> bool:
+        return self._interrupt.pressed or self._deadline.for_search <= 0.0
+
+    def _solved(
+        self, k: int, world: TaskWorld, q: Array, later: list[Array], setup: PlanningSetup | None = None
+    ) -> list[StepPlan]:
+        """Return the plans of a stage and those after it.
 
         Args:
             k: Number of the stage.
             world: The world at its start.
-            setup: The problem of its motion.
+            q: The state at its start, shape (dof,).
+            later: Goals that were rehearsed for it and for the stages after it, or none.
+            setup: The problem of its motion, if it is assembled already.
 
         Raises:
-            NotPlannedError: The planner found no motion to the goal of the first stage.
+            NotPlannedError: The planner found no motion to a goal of the first stage.
             StepFailed: It, or one after it, cannot be done.
         """
-        stage = self._stages[k]
-        with self._interruptible():
-            goals = self._goals(setup, world, stage.steps)
-        while goals:
-            time = self._deadline.for_search
-            if time <= 0.0:
-                break
-            self._checker.become(world.scene, world.held, world.pairs)
-            found = self._plan_to(self._to(setup.problem, goals), time, k == 0)
-            if not found or found.path is None:
-                if k == 0:
-                    raise NotPlannedError(found)
-                raise StepFailed(f"{stage.move.title}: {found.reason}", f"{stage.move.title}: {found.status}")
-            reached = found.path.states[-1]
-            try:
-                with self._interruptible():
-                    plans = self._steps.follow(stage.steps, world, reached, self._timing, self._deadline)
-                return found, plans + self._further(k + 1, plans[-1].after if plans else world, _end(plans, reached))
-            except StepFailed as failure:
-                self.rejected[failure.cause] += 1
-                goals = [goal for goal in goals if not np.array_equal(goal, reached)]
+        unplanned: PlanResult | None = None
+        for choices in self._choices(k, world, q, later, setup):
+            left = list(choices)
+            while left and not self._ends():
+                found = self._moved(k, world, q, [one.goal for one in left])
+                if not found or found.path is None:
+                    unplanned = found
+                    title = self._stages[k].move.title if k else "goal"
+                    self.rejected[f"{title}: {found.status}"] += 1
+                    break
+                reached = found.path.states[-1]
+                chosen = next((one for one in left if np.array_equal(one.goal, reached)), left[0])
+                try:
+                    return self._finished(k, world, found, chosen.later)
+                except StepFailed as failure:
+                    self.rejected[failure.cause] += 1
+                    left = [one for one in left if one is not chosen]
+                    if not self._search.goes_back:
+                        raise
+        if unplanned is not None and k == 0:
+            raise NotPlannedError(unplanned)
+        if unplanned is not None:
+            move = self._stages[k].move
+            raise StepFailed(f"{move.title}: {unplanned.reason}", f"{move.title}: {unplanned.status}")
         raise StepFailed(WORDS)
 
-    def _further(self, k: int, world: TaskWorld, q: Array) -> list[StepPlan]:
-        """Return the plans of a stage and those after it, from a state, shape (dof,); none after the last one.
-
-        Raises:
-            StepFailed: One cannot be done.
-        """
-        if k == len(self._stages):
-            return []
-        move = self._stages[k].move
-        problem = world.problem(self._problem, move.goal, q)
-        self._checker.become(world.scene, world.held, world.pairs)
-        with unforked(), quiet_ompl(), self._deadline.paused():
-            setup = assemble(problem, self._checker.robot, seed=self._options.seed, checker=self._checker)
-        status, reason, _ = query_fault(setup)
-        if status is not None:
-            raise StepFailed(f"{move.title}: {reason}", f"{move.title}: {status}")
-        found, plans = self._solved(k, world, setup)
+    def _finished(self, k: int, world: TaskWorld, found: PlanResult, later: list[Array]) -> list[StepPlan]:
+        """Return the plan of a motion that was found, those of the steps after it, and of all later stages."""
         assert found.path is not None
+        stage, reached = self._stages[k], found.path.states[-1]
         clearance = found.clearance if found.trajectory is None else found.motion_clearance
         deviation = 0.0 if found.trajectory is None else found.deviation
-        plan = StepPlan(
-            move, world, world, found.path, found.trajectory, clearance, use=found.limit_use, deviation=deviation
+        move = StepPlan(
+            stage.move, world, world, found.path, found.trajectory, clearance, use=found.limit_use, deviation=deviation
         )
-        return [plan, *plans]
+        with self._interruptible():
+            plans = self._steps.follow(stage.steps, world, reached, self._timing, self._deadline)
+        last = [move, *plans][-1]
+        further = [] if k + 1 == len(self._stages) else self._solved(k + 1, last.after, last.end, later)
+        if k == 0:
+            self._first = found
+        return [move, *plans, *further]
 
-    def _goals(self, setup: PlanningSetup, world: TaskWorld, steps: Sequence[AnyStep]) -> list[Array]:
-        """Return goals from which steps can be done, the nearest first: a few, or all where there is no step."""
-        if not steps:
-            return list(setup.valid_goals)
-        found, timeout = list[Array](), self._deadline.timeout
-        until = self._deadline.remaining * (1.0 - EXAMINATION)
-        for goal in self._candidates(setup):
-            late = self._deadline.remaining <= until
-            if self._interrupt.pressed or self._deadline.for_search <= 0.0 or (found and late):
+    def _moved(self, k: int, world: TaskWorld, q: Array, goals: list[Array]) -> PlanResult:
+        """Return the plan of the motion of a stage to one of goals."""
+        move, time = self._stages[k].move, self._deadline.for_search
+        if len(self._stages) > 1 or not self._search.goes_back:
+            time *= MOTION_SHARE
+        problem = self._problem if k == 0 else world.problem(self._problem, move.goal, q)
+        names = self._checker.robot.joint_names
+        states = tuple(dict(zip(names, goal.tolist(), strict=True)) for goal in goals)
+        problem = problem.model_copy(update={"goal": Goal(joints=states), "after": ()})
+        self._checker.become(world.scene, world.held, world.pairs)
+        return self._plan_to(problem, time, k == 0, move.group or self._options.group)
+
+    def _choices(
+        self, k: int, world: TaskWorld, q: Array, later: list[Array], setup: PlanningSetup | None
+    ) -> Iterator[list[_Choice]]:
+        """Yield goals of a stage among which the planner chooses, with goals of the later stages.
+
+        Raises:
+            StepFailed: There is no goal.
+        """
+        stage, last = self._stages[k], k + 1 == len(self._stages)
+        with self._interruptible():
+            made = task_goal(self._checker.robot, world, self._problem, stage.move, q, group=self._options.group)
+            kept = self._kept(made, world, later[0]) if later else None
+        if kept is not None:
+            yield [_Choice(kept, later[1:])]
+        if setup is None:
+            self._checker.become(world.scene, world.held, world.pairs)
+            with unforked(), quiet_ompl(), self._deadline.paused():
+                setup = assemble(
+                    made.problem, self._checker.robot, seed=self._options.seed, checker=self._checker,
+                    group=stage.move.group or self._options.group,
+                )  # fmt: skip
+            status, reason, _ = query_fault(setup)
+            if status is not None:
+                raise StepFailed(f"{stage.move.title}: {reason}", f"{stage.move.title}: {status}")
+        if last and not stage.steps:
+            yield [_Choice(goal, []) for goal in setup.valid_goals]
+        elif not self._search.goes_back:
+            yield [_Choice(next(self._candidates(made, setup)), [])]
+        else:
+            yield from self._rehearsed(k, world, made, setup)
+
+    def _kept(self, made: TaskGoal, world: TaskWorld, q: Array) -> Array | None:
+        """Return a rehearsed state as a goal, or None where it is none, now that the steps before it are planned."""
+        found = made.refined(q)
+        if found is None:
+            return None
+        self._steps.become(world)
+        return None if state_fault(self._steps.checker, found) else found
+
+    def _rehearsed(self, k: int, world: TaskWorld, made: TaskGoal, setup: PlanningSetup) -> Iterator[list[_Choice]]:
+        """Yield goals whose later steps can be done as far as a rehearsal shows, a few at a time."""
+        found, doubtful = list[_Choice](), list[tuple[Array, str]]()
+        wanted = self._search.wanted if k + 1 == len(self._stages) else 1
+        until, failed = self._deadline.remaining * (1.0 - EXAMINATION), Counter[int]()
+        for goal in self._candidates(made, setup):
+            if self._ends() or (found and self._deadline.remaining <= until):
                 break
+            alternative = made.goal.member_of(goal) if isinstance(made.goal, AnyGoal) else -1
+            if alternative >= 0 and failed[alternative] == MOST_FAILURES:
+                continue
             self.examined += 1
             try:
-                time = min(PER_GOAL * timeout, self._deadline.remaining)
-                self._steps.follow(steps, world, goal, None, Deadline(time))
+                with self._interruptible():
+                    found.append(_Choice(goal, self._rehearsal.later_goals(k, world, goal)))
+            except StepFailed as failure:
+                self.rejected[failure.cause] += 1
+                failed[alternative] += 1
+                doubtful.append((goal, failure.cause))
+                continue
+            if len(found) == wanted:
+                yield found
+                found = []
+        if found:
+            yield found
+        for goal, cause in doubtful[:THOROUGH]:
+            if self._ends():
+                break
+            self.rejected[cause] -= 1
+            try:
+                with self._interruptible():
+                    later = self._rehearsal.later_goals(k, world, goal, thorough=True)
             except StepFailed as failure:
                 self.rejected[failure.cause] += 1
                 continue
-            found.append(goal)
-            if len(found) == WANTED:
-                break
-        return found
+            yield [_Choice(goal, later)]
 
-    def _candidates(self, setup: PlanningSetup) -> Iterator[Array]:
+    def _candidates(self, made: TaskGoal, setup: PlanningSetup) -> Iterator[Array]:
         """Yield goals, the nearest first; then others that are sampled, where the goal is in the workspace."""
-        robot, goals = setup.robot, setup.valid_goals
-        yield from goals[np.argsort(direct_durations(setup.start, goals, robot.limits), kind="stable")]
-        goal = workspace_goal(robot, setup.problem)
-        if goal is None or setup.constraints is not None or len(setup.held):
+        goals, goal = setup.valid_goals, made.goal
+        yield from goals[np.argsort(direct_durations(setup.start, goals, setup.robot.limits), kind="stable")]
+        if goal is None or setup.constraints is not None:
             return
         rng = np.random.default_rng([setup.seed, 1])
-        for _ in range(ROUNDS):
-            yield from sample(goal, setup.checker, rng, GOAL_STATES, GOAL_ATTEMPTS).states
+        if isinstance(goal, AnyGoal):
+            yield from made.held_at_start(goal.nearest_states(setup.checker, rng, ALTERNATIVES))
+        for _ in range(1 if isinstance(goal, AnyGoal) else ROUNDS):
+            found = sample(goal, setup.checker, rng, GOAL_STATES, GOAL_ATTEMPTS).states
+            yield from made.held_at_start(found)
 
-    def _to(self, problem: Problem, goals: list[Array]) -> Problem:
-        """Return a problem with goal states in place of its goal."""
-        names = self._checker.robot.joint_names
-        states = tuple(dict(zip(names, goal.tolist(), strict=True)) for goal in goals)
-        return problem.model_copy(update={"goal": Goal(joints=states), "after": ()})
-
-    def _said(self, result: TaskResult) -> TaskResult:
+    def _reported(self, result: TaskResult) -> TaskResult:
         """Return a result of the given problem, with the goals that were examined."""
         steps = self._times["steps"]
         times = {**result.times, "steps": steps, "total": result.times.get("total", 0.0) + steps}
         return replace(
             result, problem=self._problem, times=times, goals_examined=self.examined,
-            goals_rejected=dict(self.rejected), checks=result.checks + self._steps.checker.check_counts.states,
+            goals_rejected=dict(+self.rejected), checks=result.checks + self._steps.checker.check_counts.states,
         )  # fmt: skip
 
     def _failed(self, reason: str) -> TaskResult:
         """Return the result of a task whose steps cannot be done."""
-        counts = self.rejected.most_common(MOST_CAUSES)
+        counts = (+self.rejected).most_common(MOST_CAUSES)
         causes = "; ".join(f"{cause} ({n} of {self.examined} goals)" for cause, n in counts)
         robot, status = self._checker.robot, PlanStatus.STEP_FAILED
         if self._deadline.for_search <= 0.0:
@@ -257,7 +332,7 @@ class TaskPlanner:
             status=status, reason="; ".join(filter(None, [reason, causes])), problem=self._problem, robot=robot.name,
             joint_names=robot.joint_names, planner="task", seed=self._options.seed, robot_digest=digest(robot),
         )  # fmt: skip
-        return self._said(made)
+        return self._reported(made)
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
@@ -277,75 +352,3 @@ class NotPlannedError(Exception):
         """Keep the result."""
         super().__init__(result.reason)
         self.result = result
-
-
-def _end(plans: Sequence[StepPlan], q: Array) -> Array:
-    """Return the state after steps, or the one before them, shape (dof,), where there are none."""
-    return plans[-1].end if plans else q
-
-
-def task_fault(result: TaskResult, motion: Trajectory) -> str:
-    """Return why a motion with the times of a task's steps is not free in the scenes of these, or an empty text.
-
-    Args:
-        result: The task.
-        motion: A motion such as its own, or that at another rate.
-    """
-    robot = load_robot(result.problem.robot)
-    for step in result.steps:
-        checker = CollisionChecker(robot, step.scene, step.attached, step.allowed)
-        check = full_check(checker, _between(motion, step.start, step.end))
-        if check and not isnan(step.left):
-            for pair in step.leaving:
-                checker.allow(*pair, allowed=False)
-            check = full_check(checker, _between(motion, step.left, step.end))
-        if not check:
-            return f"{step.title}: {check.reason}"
-    return ""
-
-
-def _between(motion: Trajectory, start: float, end: float) -> Trajectory:
-    """Return the part of a motion between two times [s]."""
-    return motion.before(end).after(start)
-
-
-def _whole(found: PlanResult, plans: list[StepPlan], robot: Robot, problem: Problem) -> TaskResult:
-    """Return the result of a task from the plan to its goal and the plans of the steps after it."""
-    motion, path = found.trajectory, found.path
-    assert path is not None
-    start, time = (nan, nan) if motion is None else (0.0, motion.duration)
-    clearance = found.clearance if motion is None else found.motion_clearance
-    bodies = problem.scene, problem.attached, problem.allowed
-    steps = [TaskStep(GOAL, GOAL, start, time, path, clearance, *bodies)]
-    for plan in plans:
-        end = nan if plan.motion is None else time + plan.motion.duration
-        left = plan.left if plan.motion is None else time + plan.left
-        steps.append(_step(plan, time, end, left))
-        time = end
-    result = replace(TaskResult.of(found), steps=tuple(steps))
-    if motion is None:
-        return result
-    whole = joined([motion, *(plan.motion for plan in plans if plan.motion is not None)])
-    uses = [found.limit_use, *(plan.use for plan in plans)]
-    use = {name: max(one.get(name, 0.0) for one in uses) for name in dict.fromkeys(n for one in uses for n in one)}
-    return replace(
-        result, trajectory=whole, limit_use=use | dict(whole.use(robot.limits)),
-        motion_clearance=min(step.clearance for step in steps),
-        deviation=max([found.deviation, *(plan.deviation for plan in plans)]),
-    )  # fmt: skip
-
-
-def _step(plan: StepPlan, start: float, end: float, left: float) -> TaskStep:
-    """Return the record of a step that was planned."""
-    step, world, after = plan.step, plan.world, plan.after
-    released, grasped = tuple[str, ...](), tuple[str, ...]()
-    if isinstance(step, ReleaseStep):
-        released = step.objects or world.held_by(step.hand)
-    elif isinstance(step, GraspStep):
-        grasped = (step.object,)
-    leaving = world.leaving_pairs(step.hand) if isinstance(step, RetreatStep) else ()
-    gone = tuple(name for name in released if name not in after.scene and name not in after.held)
-    return TaskStep(
-        step.kind, step.title, start, end, plan.path, plan.clearance, tuple(world.scene.values()),
-        tuple(world.held.values()), tuple(sorted(world.pairs)), left, tuple(sorted(leaving)), released, grasped, gone,
-    )  # fmt: skip

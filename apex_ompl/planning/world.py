@@ -29,7 +29,17 @@ from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import finite_array
 
 if TYPE_CHECKING:
-    from apex_ompl.scene.bodies import GridFile, HalfSpace, MeshFile, PointFile, RoundBar, Sphere, VoxelFile
+    from apex_ompl.scene.bodies import (
+        ContactFace,
+        GridFile,
+        HalfSpace,
+        HandGrasp,
+        MeshFile,
+        PointFile,
+        RoundBar,
+        Sphere,
+        VoxelFile,
+    )
 
 KEPT_CLOUDS = 8  # temporary files that no obstacle has any more
 
@@ -55,6 +65,8 @@ class ObstacleFields(TypedDict, total=False):
     velocity: Sequence[float] | None
     trajectory: Sequence[Sequence[float]] | None
     appears: float
+    contact: ContactFace | Mapping[str, Any] | None
+    grasps: Sequence[HandGrasp | Mapping[str, Any]]
 
 
 class World:
@@ -285,7 +297,7 @@ class World:
             held, left = self.held.get(name) if isinstance(name, str) else None, list[Obstacle]()
             if at is not None and held is not None:
                 pose = self.checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
-                shape = given_fields(held, ("link", "links", "touch_links", "contact"))
+                shape = given_fields(held, ("link", "links", "touch_links"))
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
             self.checker.detach(name)
             self._add(left)

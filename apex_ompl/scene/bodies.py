@@ -180,19 +180,49 @@ MOTION = ("velocity", "trajectory", "appears")  # fields of the motion of an obs
 FILES = ("mesh", "points", "voxels", "distance_grid")  # shapes that are read from files
 
 
+class ContactFace(StrictModel):
+    """The face of an object that is brought into contact: center [m] and outward axis, in the object's frame."""
+
+    point: Vector = (0.0, 0.0, 0.0)
+    axis: Direction = (0.0, 0.0, 1.0)
+
+
+class HandGrasp(StrictModel):
+    """A pose at which a hand takes an object, in the object's frame.
+
+    Attributes:
+        position: Position of the hand's grasp point [m].
+        orientation: Orientation of the hand's palm, a quaternion xyzw.
+        hand: Name of the hand; any by default.
+    """
+
+    position: Vector
+    orientation: Quaternion
+    hand: Name | None = None
+
+    @property
+    def pose(self) -> Array:
+        """Homogeneous transform, shape (4, 4) [m]."""
+        return pose_matrix(self.position, self.orientation)
+
+
 class MassiveBody(Body):
-    """A solid that may have a mass; its shape, of uniform density, determines what is not given.
+    """A solid that may be held and have a mass; its shape, of uniform density, determines what is not given.
 
     Attributes:
         mass: Mass [kg]; without it the solid counts as weightless.
         center_of_mass: Center of mass in the object's frame [m].
         inertia: Inertia about the center of mass along the axes of the object's frame, in URDF's order ixx, ixy, ixz,
             iyy, iyz, izz [kg m^2].
+        contact: Its contact face.
+        grasps: Where hands may take it.
     """
 
     mass: Mass | None = None
     center_of_mass: Vector | None = None
     inertia: tuple[float, float, float, float, float, float] | None = None
+    contact: ContactFace | None = None
+    grasps: tuple[HandGrasp, ...] = ()
 
     @model_validator(mode="after")
     def _possible_inertia(self) -> Self:
@@ -254,13 +284,6 @@ def same_solid(first: Body, second: Body) -> bool:
     return first is second or all(getattr(first, field) == getattr(second, field) for field in SOLID)
 
 
-class ContactFace(StrictModel):
-    """The face of a held object that is brought into contact: center [m] and outward axis, in the object's frame."""
-
-    point: Vector = (0.0, 0.0, 0.0)
-    axis: Direction = (0.0, 0.0, 1.0)
-
-
 def _one_of_both(schema: dict[str, Any]) -> None:
     """Require a link or links."""
     schema["required"].remove("link")
@@ -275,7 +298,6 @@ class AttachedObject(MassiveBody):
         links: Two links that hold it together: it is attached to the first, and the second one keeps its pose relative
             to that along the whole path.
         touch_links: Links that it may touch; None means all links of the hands that hold it.
-        contact: Its contact face.
     """
 
     model_config = ConfigDict(json_schema_extra=_one_of_both)
@@ -283,7 +305,6 @@ class AttachedObject(MassiveBody):
     link: Name
     links: tuple[Name, Name] | None = None
     touch_links: tuple[Name, ...] | None = None
-    contact: ContactFace | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import (
     BeforeValidator,
+    ConfigDict,
     Field,
     PositiveFloat,
     PrivateAttr,
@@ -27,16 +28,7 @@ from pydantic import (
 from apex_ompl.errors import FileFormatError, ParameterError, nearest_name
 from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located, pose_matrix
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
-from apex_ompl.scene.steps import (
-    GraspStep,
-    HandStep,
-    LineStep,
-    ReleaseStep,
-    RetreatStep,
-    Step,
-    TurnStep,
-    WaitStep,
-)
+from apex_ompl.scene.steps import AllowStep, MotionStep, Names, SimultaneousStep, TogetherStep
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
@@ -45,7 +37,7 @@ from apex_ompl.util.schema import StrictModel, check_version, dump_yaml, read_ya
 SCHEMA = "apex-ompl/problem/1"
 
 
-GOALS = ("joints", "alignment", "poses", "any_of")
+GOALS = ("joints", "alignment", "poses", "grasp", "any_of", "all_of")
 """Kinds of goals."""
 
 Poses = Mapping[str, Mapping[str, float]]
@@ -196,11 +188,27 @@ class PoseTarget(StrictModel):
         return self.turn is None and not any(self.lower) and not any(self.upper)
 
 
+class GraspGoal(StrictModel):
+    """A hand at any of the grasps of an object, an obstacle or one that another hand holds, where that is at the start.
+
+    Attributes:
+        object: The object, which has ``grasps``.
+        hand: The hand.
+        approach: Displacement along the hand's own axes, by which it goes straight to the grasp after the goal [m].
+        remaining: Displacement from the goal to the grasp, by which a later step goes [m].
+    """
+
+    object: Name
+    hand: Name
+    approach: Vector | None = None
+    remaining: Vector | None = None
+
+
 class Goal(StrictModel):
     """A goal: joint configurations of which one is to be reached, an alignment of held objects, poses, or several.
 
     Poses are reached all at once, by one frame each; joints that move none of the frames stay as they are at the start.
-    Of the goals in ``any_of``, any will do.
+    Of the goals in ``any_of``, any will do; poses and grasps in ``all_of`` are reached together.
     """
 
     joints: (
@@ -213,7 +221,9 @@ class Goal(StrictModel):
     ) = None
     alignment: Alignment | None = None
     poses: Annotated[tuple[PoseTarget, ...], Field(min_length=1)] | None = None
+    grasp: GraspGoal | None = None
     any_of: Annotated[tuple[Goal, ...], Field(min_length=1)] | None = None
+    all_of: Annotated[tuple[Goal, ...], Field(min_length=2)] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
@@ -226,6 +236,8 @@ class Goal(StrictModel):
             raise ValueError(f"more than one pose is given for {twice[0]!r}")
         if any(one.any_of is not None for one in self.any_of or ()):
             raise ValueError("expected no any_of inside of any_of")
+        if any(one.joints or one.alignment or one.all_of for one in self.all_of or ()):
+            raise ValueError("expected poses, grasps or any_of inside of all_of")
         return self
 
     @property
@@ -235,6 +247,10 @@ class Goal(StrictModel):
         Raises:
             ParameterError: The goals in ``any_of`` have different ones.
         """
+        if self.all_of is not None:
+            return {frame: by for one in self.all_of for frame, by in one.approaches.items()}
+        if self.grasp is not None:
+            return {} if self.grasp.approach is None else {self.grasp.hand: self.grasp.approach}
         each = [one.approaches for one in self.any_of or ()]
         each = each or [{pose.frame: pose.approach for pose in self.poses or () if pose.approach is not None}]
         if any(one != each[0] for one in each):
@@ -244,8 +260,12 @@ class Goal(StrictModel):
     @property
     def before_approach(self) -> Goal:
         """The goal with the poses where approaches start, and without these."""
-        if self.any_of is not None:
-            return self.model_copy(update={"any_of": tuple(one.before_approach for one in self.any_of)})
+        for kind in ("any_of", "all_of"):
+            if (several := getattr(self, kind)) is not None:
+                return self.model_copy(update={kind: tuple(one.before_approach for one in several)})
+        if self.grasp is not None and self.grasp.approach is not None:
+            moved = {"approach": None, "remaining": self.grasp.approach}
+            return self.model_copy(update={"grasp": self.grasp.model_copy(update=moved)})
         poses = None if self.poses is None else tuple(pose.before_approach for pose in self.poses)
         return self.model_copy(update={"poses": poses})
 
@@ -256,21 +276,27 @@ class Goal(StrictModel):
         return self if self.joints is None else Goal(joints=tuple({**values, **given} for given in self.joints))
 
 
-class MoveStep(Step):
+class MoveStep(MotionStep):
     """A motion to a further goal, by the planner.
 
     Attributes:
         goal: The goal; joints that one by joint names leaves out stay.
+        group: Groups and joints that may move; all by default.
     """
 
     kind: Literal["move"] = "move"
     goal: Goal
+    group: Names | None = None
 
     @property
     def subject(self) -> str:
         """What is moved, or the kind of goal."""
         if self.goal.any_of is not None:
             return counted(len(self.goal.any_of), "goal")
+        if self.goal.all_of is not None:
+            return " and ".join(MoveStep(goal=one).subject for one in self.goal.all_of)
+        if self.goal.grasp is not None:
+            return f"{self.goal.grasp.hand} to {self.goal.grasp.object}"
         if self.goal.poses is not None:
             return " and ".join(pose.frame for pose in self.goal.poses)
         if self.goal.alignment is None:
@@ -279,11 +305,14 @@ class MoveStep(Step):
         return " and ".join(one.link if isinstance(one, WorldVector) else one for one in sides)
 
 
-AnyStep = Annotated[
-    MoveStep | LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep,
-    Field(discriminator="kind"),
-]
+AnyStep = Annotated[MoveStep | SimultaneousStep | AllowStep | TogetherStep, Field(discriminator="kind")]
 """A step after the goal in a problem file."""
+
+
+def _goal_or_steps(schema: dict[str, Any]) -> None:
+    """Require a goal or steps in files."""
+    schema["required"].remove("goal")
+    schema["anyOf"] = [{"required": ["goal"]}, {"required": ["after"]}]
 
 
 class Problem(StrictModel):
@@ -298,10 +327,12 @@ class Problem(StrictModel):
             a hand and at the origin of a link.
         allowed: Pairs of bodies that may touch and overlap: names of links, held objects, obstacles and fixtures.
         start: Joint name -> value of the start state.
-        goal: The goal.
+        goal: The goal; by default the start, where ``after`` lists steps.
         constraints: What holds along the whole path to the goal.
         after: Steps after the goal, which :func:`apex_ompl.plan_task` plans too.
     """
+
+    model_config = ConfigDict(json_schema_extra=_goal_or_steps)
 
     schema_id: Literal["apex-ompl/problem/1"] = Field(default="apex-ompl/problem/1", alias="schema")
     name: Name
@@ -319,6 +350,13 @@ class Problem(StrictModel):
     @classmethod
     def _nothing_is_empty(cls, value: Any) -> Any:
         return () if value is None else value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_the_start(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and "goal" not in data and data.get("after") and "start" in data:
+            return {**data, "goal": {"joints": data["start"]}}
+        return data
 
     @model_validator(mode="after")
     def _unique_names(self) -> Self:
@@ -446,35 +484,6 @@ def _robot_file(robot: str, folder: Path) -> str:
 def _poses(poses_of: Callable[[str], Poses], robot: Any, folder: Path) -> Poses:
     """Return the named poses of the robot of a file; none where its field is faulty, which is reported then."""
     return poses_of(_robot_file(robot, folder)) if isinstance(robot, str) else {}
-
-
-def with_lines(problem: Problem) -> Problem:
-    """Return a problem with a step ``line`` in place of each approach.
-
-    Raises:
-        ParameterError: The goals in an ``any_of`` have different approaches.
-    """
-    steps = [step for given in problem.after for step in _with_lines(given)]
-    goal, *lines = _with_lines(MoveStep(goal=problem.goal))
-    assert isinstance(goal, MoveStep)
-    return problem.model_copy(update={"goal": goal.goal, "after": (*lines, *steps)})
-
-
-def _with_lines(step: AnyStep) -> list[AnyStep]:
-    """Return a step, and for each approach of its goal a line after it.
-
-    Frames with the same approach go in step.
-    """
-    if not isinstance(step, MoveStep):
-        return [step]
-    approaches = step.goal.approaches
-    if not approaches:
-        return [step]
-    frames = dict[Vector, list[str]]()
-    for frame, by in approaches.items():
-        frames.setdefault(by, []).append(frame)
-    lines = [LineStep(frame=tuple(names), by=by, axes="frame") for by, names in frames.items()]
-    return [step.model_copy(update={"goal": step.goal.before_approach}), *lines]
 
 
 def _hint(name: str, known: Iterable[str]) -> str:

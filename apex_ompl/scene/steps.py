@@ -62,10 +62,24 @@ class Step(StrictModel):
     def _kind_first(self, others: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Return the fields with the kind, which is not left out as a default, and one name without a list."""
         data = {"kind": self.kind, **others(self)}
-        return {k: v[0] if k in ("frame", "objects") and v is not None and len(v) == 1 else v for k, v in data.items()}
+        return {
+            k: v[0] if k in ("frame", "objects", "group") and v is not None and len(v) == 1 else v
+            for k, v in data.items()
+        }
 
 
-class LineStep(Step):
+class MotionStep(Step):
+    """A step along which frames move.
+
+    Attributes:
+        blend: Radius around its end, inside of which the origins of hands may leave its way, since the next step starts
+            before it ends, where that one is a motion in the same world [m]. By default the robot rests in between.
+    """
+
+    blend: Size | None = None
+
+
+class LineStep(MotionStep):
     """A straight line of frames by a displacement, or of a contact face to one that it is then aligned with.
 
     Attributes:
@@ -116,7 +130,7 @@ class LineStep(Step):
         return " and ".join(self.frame) + (f" onto {self.onto}" if self.onto is not None else "")
 
 
-class TurnStep(Step):
+class TurnStep(MotionStep):
     """Frames turn together, as one rigid body, about the origin of the first.
 
     Attributes:
@@ -206,7 +220,7 @@ class GraspStep(Step):
         return f"{self.object} by {self.hand}"
 
 
-class RetreatStep(Step):
+class RetreatStep(MotionStep):
     """A hand leaves what it released along a straight line, with its orientation kept.
 
     Attributes:
@@ -242,3 +256,78 @@ class WaitStep(Step):
     def subject(self) -> str:
         """The time."""
         return f"{self.seconds:g} s"
+
+
+class AttachStep(Step):
+    """An obstacle becomes part of a link, where it is; nothing moves.
+
+    Attributes:
+        object: The obstacle.
+        link: The link, or a hand, whose palm it is then.
+    """
+
+    kind: Literal["attach"] = "attach"
+    object: Name
+    link: Name
+
+    @property
+    def subject(self) -> str:
+        """The object, and the link."""
+        return f"{self.object} to {self.link}"
+
+
+class DetachStep(Step):
+    """A held object stands in the scene where it is; nothing moves, and its hand may touch it until it retreats.
+
+    Attributes:
+        object: The object.
+    """
+
+    kind: Literal["detach"] = "detach"
+    object: Name
+
+    @property
+    def subject(self) -> str:
+        """The object."""
+        return self.object
+
+
+class AllowStep(Step):
+    """Bodies may touch and overlap from now on, or no longer.
+
+    Attributes:
+        pairs: Pairs of links, held objects, obstacles and fixtures.
+        contact: Whether they may.
+    """
+
+    kind: Literal["allow"] = "allow"
+    pairs: Annotated[tuple[tuple[Name, Name], ...], Field(min_length=1)]
+    contact: bool = True
+
+    @property
+    def subject(self) -> str:
+        """The pairs."""
+        pairs = ", ".join(" <-> ".join(pair) for pair in self.pairs)
+        return pairs if self.contact else f"{pairs} no longer"
+
+
+SimultaneousStep = (
+    LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep | AttachStep | DetachStep
+)
+"""A step that may happen beside others."""
+
+
+class TogetherStep(Step):
+    """Steps that start at once, of arms that share no joint; it ends when the longest of them does.
+
+    Attributes:
+        steps: The steps.
+    """
+
+    kind: Literal["together"] = "together"
+    steps: Annotated[tuple[Annotated[SimultaneousStep, Field(discriminator="kind")], ...], Field(min_length=2)]
+
+    @property
+    def subject(self) -> str:
+        """The steps."""
+        return f"({', '.join(step.title for step in self.steps)})"

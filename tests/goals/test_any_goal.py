@@ -29,10 +29,10 @@ from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.goals.pose_goal import PoseGoal, pose_goals
 from apex_ompl.loop.referee import is_at_goal
 from apex_ompl.ompl.setup import workspace_goal
+from apex_ompl.planning.task_problem import with_lines
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene import OnPlane
 from apex_ompl.scene.constraints import PoseTolerance
-from apex_ompl.scene.problem import with_lines
 
 
 def hand_pose(robot: Robot, q: np.ndarray, hand: str = "left_hand") -> pin.SE3:

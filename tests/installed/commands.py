@@ -37,22 +37,22 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ((0,), "info"),
     ((0,), "schema"),
     ((0,), "check own.yaml"),
-    ((0,), "plan own.yaml --timeout 20 --out plan.npz --snapshot --leave-contact 0.001"),
-    (
-        (0,),
-        "plan own.yaml --planner rrtconnect --params params.yaml --set range=0.7 --seed 1 --timeout 20 --no-simplify "
-        "--timing-method spline --velocity-scale 0.9 --acceleration-scale 0.9 --jerk-scale 0.9 "
-        "--max-velocity left_joint1=1.5 --max-acceleration left_joint1=10 --max-jerk left_joint1=1000 "
-        "--minimum-duration 2.5 --out motion.traj.yaml --controllers --json",
+    *(
+        ((0,), f"{command} {rest}")
+        for command in ("plan", "sequence")
+        for rest in (
+            "own.yaml --timeout 20 --out plan.npz --snapshot --leave-contact 0.001",
+            "own.yaml --planner rrtconnect --params params.yaml --set range=0.7 --seed 1 --timeout 20 --no-simplify "
+            "--timing-method spline --velocity-scale 0.9 --acceleration-scale 0.9 --jerk-scale 0.9 "
+            "--max-velocity left_joint1=1.5 --max-acceleration left_joint1=10 --max-jerk left_joint1=1000 "
+            "--minimum-duration 2.5 --out motion.traj.yaml --controllers --json",
+            "own.yaml --timeout 20 --out sampled.csv --rate 1000 --joints left_arm,right_hand_synergy",
+            "ball_in_cup --timeout 20 --no-timing --out path.json",
+            "ball_in_cup --timeout 20 --objective calm --calm-factor 1.3 --max-tool-speed 1.0 --payload left_hand=0.5 "
+            "--torque-scale 0.9 --max-torque left_joint1=80",
+            "ball_in_cup --timeout 20 --objective length --no-torque-limits",
+        )
     ),
-    ((0,), "plan own.yaml --timeout 20 --out sampled.csv --rate 1000 --joints left_arm,right_hand_synergy"),
-    ((0,), "plan ball_in_cup --timeout 20 --no-timing --out path.json"),
-    (
-        (0,),
-        "plan ball_in_cup --timeout 20 --objective calm --calm-factor 1.3 --max-tool-speed 1.0 --payload left_hand=0.5 "
-        "--torque-scale 0.9 --max-torque left_joint1=80",
-    ),
-    ((0,), "plan ball_in_cup --timeout 20 --objective length --no-torque-limits --to-goal"),
     (
         (0, 1),
         "run popup/vertical/large/12 --method no-network --clock sim --prediction cv --speed 0.9 --budget 0.05 "

@@ -166,6 +166,7 @@ def _use_kinematics() -> None:
 def _use_tasks() -> None:
     """Tasks: the steps after a goal."""
     import apex_ompl
+    from apex_ompl.planning import TaskSearch
 
     robot = apex_ompl.load_robot("dual_panda_softhand")
     task = apex_ompl.plan_task("stack_boxes", timeout=20.0)
@@ -175,6 +176,13 @@ def _use_tasks() -> None:
     assert apex_ompl.TaskResult.load("task.npz").as_dict() == task.as_dict()
     with apex_ompl.MotionPlanner(robot) as planner:
         assert planner.plan_task(apex_ompl.load_problem("handover"), timeout=20.0)
+    with apex_ompl.MotionPlanner("panda") as planner:
+        assert (
+            planner.sequence(
+                "home", [{"kind": "wait", "seconds": 1.0}], search=TaskSearch(wanted=1), timeout=20.0
+            ).goal_time
+            == 0.0
+        )
 
 
 def _use_records() -> None:

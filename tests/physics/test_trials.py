@@ -55,6 +55,21 @@ def test_a_seed_is_one_start_and_without_one_it_is_that_of_the_problem(robot: Ro
     assert trial.real.attached[:2] == trial.known.attached and len(trial.real.attached) == 22  # with the liquid
 
 
+def test_obstacles_that_are_grasped_later_stand_free(robot: Robot) -> None:
+    problem = cached_problem("stack_three_boxes")
+    for seed in (None, 3):
+        trial = draw(robot, problem, seed, Spread(), DENSITY)
+        assert trial.known.scene == problem.scene and not trial.known.attached
+        assert [one.name for one in trial.real.scene] == ["lamp"]
+        for held in trial.real.attached:
+            there = robot.link_pose(robot.random_state(np.random.default_rng(0), 1)[0], held.link) @ held.pose
+            off = there - next(one for one in problem.scene if one.name == held.name).pose
+            np.testing.assert_allclose(off[:3, 3], trial.off[held.name], atol=1e-9)
+            assert np.abs(off[:3, :3]).max() < 1e-7 and abs(off[2, 3]) < 1e-9
+            assert np.any(off[:2, 3] > 1e-6) or seed is None or np.any(off[:2, 3] < -1e-6)
+            assert held.mass is not None and held.mass > 0.0
+
+
 @pytest.mark.parametrize(("name", "value"), [("joints", -0.1), ("place", np.nan), ("mass", 1.0), ("friction", np.inf)])
 def test_a_spread_that_is_out_of_range_is_refused(name: str, value: float) -> None:
     with pytest.raises(ParameterError, match=name):

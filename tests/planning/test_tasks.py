@@ -15,9 +15,9 @@ from tasks import Checker, contacts, poses
 
 from apex_ompl import MotionPlanner, PlanResult, PlanStatus, TaskResult, Timing, plan_task
 from apex_ompl.errors import FileFormatError, ParameterError
+from apex_ompl.planning.task_motion import task_fault
 from apex_ompl.planning.task_result import load_result
 from apex_ompl.planning.task_world import check_steps
-from apex_ompl.planning.tasks import task_fault
 from apex_ompl.robot import Robot
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene import Problem

@@ -1,0 +1,272 @@
+"""Sequences: choices of grasps that suit later steps, blends, steps at once, and what changes in the world."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from planning import cached_problem
+from tasks import contacts, poses
+
+from apex_ompl import ApexError, MotionPlanner, PoseTarget, TaskResult, load_robot, plan_task
+from apex_ompl.cli.parser import main
+from apex_ompl.goals.grasp_goal import MOST, pose_alternatives
+from apex_ompl.planning import TaskSearch
+from apex_ompl.planning.superposition import abreast, superposed
+from apex_ompl.planning.task_result import load_result
+from apex_ompl.problems import cells
+from apex_ompl.scene import Goal, Problem
+from apex_ompl.timing import Trajectory, time_path
+from apex_ompl.timing.rests import is_at_rest
+from apex_ompl.types import Array
+
+SECONDS = 60.0
+READY = ("pick_and_place", "pick_and_hand_over", "stack_three_boxes")
+ENDS = {"pick_and_place": ("box",), "pick_and_hand_over": ("bar",), "stack_three_boxes": ("a", "b", "c")}
+DOWN = (1.0, 0.0, 0.0, 0.0)
+SIDEWAYS = (0.0, 0.70710678, 0.0, 0.70710678)  # the gripper points along x
+
+
+@cache
+def planned(name: str) -> TaskResult:
+    return plan_task(name, timeout=SECONDS)
+
+
+def entry(kind: str, **fields: Any) -> dict[str, Any]:
+    return {"kind": kind, **fields}
+
+
+@pytest.mark.parametrize("name", READY)
+def test_ready_sequences_end_with_the_objects_where_they_belong(name: str) -> None:
+    result, problem = planned(name), cached_problem(name)
+    robot = load_robot(problem.robot)
+    assert result, result.reason
+    assert result.trajectory is not None and is_at_rest(result.trajectory, result.trajectory.duration)
+    wanted = {p.frame: p.position for step in problem.after if step.kind == "move" for p in step.goal.poses or ()}
+    final = poses(robot, result.steps[-1], result.trajectory.positions[-1])
+    for body in ENDS[name]:
+        assert body in {one.name for one in result.steps[-1].scene}
+        assert np.abs(final[body][:3, 3] - wanted[body]).max() < 2e-3
+        assert np.arccos(min(1.0, final[body][2, 2])) < 0.02  # upright
+    assert not list(contacts(robot, result, 0.15))
+    for one, following in pairwise(result.steps):  # nothing jumps
+        assert one.end == pytest.approx(following.start, abs=1e-9)
+        before, after = (poses(robot, step, result.trajectory(one.end)) for step in (one, following))
+        assert max(np.abs(before[body] - after[body]).max() for body in before) < 1e-5
+
+
+def test_a_blend_is_faster_keeps_the_limits_and_stays_near_where_the_step_ends() -> None:
+    problem, robot = cached_problem("pick_and_place"), load_robot("panda")
+    result = planned("pick_and_place")
+    rests = tuple(s.model_copy(update={"blend": None}) if hasattr(s, "blend") else s for s in problem.after)
+    slower = plan_task(problem.model_copy(update={"after": rests}), timeout=SECONDS)
+    assert result.trajectory is not None and slower.trajectory is not None
+    assert any(step.blended for step in result.steps) and not any(step.blended for step in slower.steps)
+    assert result.trajectory.duration < slower.trajectory.duration - 0.02
+    assert max(result.trajectory.use(robot.limits).values()) <= 1.0 + 1e-9
+    hand = robot.hands["hand"]
+    for step in result.steps:
+        if step.blended:
+            assert not is_at_rest(result.trajectory, step.end)
+            corner = robot.link_pose(step.path.states[-1], hand.palm) @ [*hand.point, 1.0]
+            there = robot.link_pose(result.trajectory(step.end), hand.palm) @ [*hand.point, 1.0]
+            assert np.linalg.norm(there - corner) <= 0.05
+
+
+def motion(states: Array) -> Trajectory:
+    robot = load_robot("panda")
+    return time_path(states, robot.limits, robot.joint_names).trajectory
+
+
+def test_sums_of_motions_are_the_sums_of_their_displacements() -> None:
+    q = load_robot("panda").home
+    first = motion(np.stack([q, q + 0.3]))
+    second = motion(np.stack([q + 0.3, q + 0.3 - np.linspace(0.1, 0.7, 7)]))
+    begin = first.duration - 0.1
+    both = superposed([(first, 0.0), (second, begin)])
+    for t in np.random.default_rng(0).uniform(0.0, both.duration, 50):
+        expected = first(min(t, first.duration)) + second(np.clip(t - begin, 0.0, second.duration)) - (q + 0.3)
+        assert np.abs(both(t) - expected).max() < 1e-9
+        step = 1e-6
+        numeric = (both(min(t + step, both.duration)) - both(max(t - step, 0.0))) / (2.0 * step)
+        assert step < t < both.duration - step and np.abs(both(t, 1) - numeric).max() < 1e-4
+    assert both.duration == pytest.approx(begin + second.duration)
+
+
+def test_paths_abreast_take_the_joints_of_each() -> None:
+    q = np.zeros(4)
+    one, two = np.array([q, [1, 0, 0, 0], [1, 1, 0, 0]], float), np.array([q, [0, 0, 2, 2]], float)
+    found = abreast([one, two])
+    np.testing.assert_allclose(found, [[0, 0, 0, 0], [1, 0, 1, 1], [1, 1, 2, 2]])
+    np.testing.assert_array_equal(abreast([q[None], q[None]]), q[None])
+
+
+def shelved(planner: MotionPlanner) -> list[dict[str, Any]]:
+    """Steps of taking a box from above or from the side, and putting it under a low roof."""
+    planner.world.add(name="roof", box=(0.24, 0.3, 0.02), position=(0.55, 0.3, 0.52))
+    grasps = [{"position": (0, 0, 0.02), "orientation": DOWN}, {"position": (-0.01, 0, 0.0), "orientation": SIDEWAYS}]
+    planner.world.add(name="box", box=(0.05, 0.05, 0.1), position=(0.5, -0.25, 0.35), grasps=grasps)
+    below = PoseTarget(frame="box", position=(0.55, 0.3, 0.45), orientation=(0, 0, 0, 1))
+    return [
+        entry("move", goal={"grasp": {"object": "box", "hand": "hand", "approach": (0, 0, 0.08)}}),
+        entry("grasp", hand="hand", object="box"),
+        entry("move", goal=below),
+        entry("release", hand="hand"),
+        entry("retreat", hand="hand", distance=0.15),
+        entry("move", goal="home"),
+    ]
+
+
+def test_the_grasp_is_one_that_suits_the_place() -> None:
+    with MotionPlanner("panda") as planner:
+        steps = shelved(planner)
+        blind = planner.sequence("home", steps, timeout=SECONDS, search=TaskSearch(goes_back=False))
+        assert not blind and "move box" in blind.reason and sum(blind.goals_rejected.values()) == 1
+        result = planner.sequence("home", steps, timeout=SECONDS)
+        assert result, result.reason
+        assert any("move box" in cause for cause in result.goals_rejected)
+        assert sum(result.goals_rejected.values()) < result.goals_examined
+        taken = next(step for step in result.steps if step.grasped)
+        hand = planner.fk(taken.path.states[-1], "hand")
+        assert hand[0, 2] > 0.999  # from the side
+        assert "box" in planner.world.obstacles and not planner.world.held  # the world is as before
+        assert {step.kind for step in result.steps} == {"goal", "line", "grasp", "move", "release", "retreat"}
+
+
+def test_what_cannot_be_done_is_counted_by_cause() -> None:
+    with MotionPlanner("panda") as planner:
+        steps = shelved(planner)
+        planner.world.add(name="block", box=(0.2, 0.2, 0.2), position=(0.55, 0.3, 0.4))  # where the box is to go
+        result = planner.sequence("home", steps, timeout=SECONDS)
+        assert result.status.name == "STEP_FAILED" and not result.steps
+        assert "move box" in result.reason and f"of {result.goals_examined} goals" in result.reason
+        assert sum(result.goals_rejected.values()) == result.goals_examined > 1
+
+
+def test_a_link_takes_an_object_and_leaves_it_and_contacts_are_allowed_for_a_time() -> None:
+    with MotionPlanner("panda") as planner:
+        at = planner.fk("home", "hand")[:3, 3]
+        planner.world.add(name="pad", box=(0.04, 0.04, 0.04), position=tuple(at + [0.0, 0.0, -0.03]))
+        below = tuple(at - [0.0, 0.0, 0.06])  # which it touches
+        planner.world.add(name="floor", box=(0.2, 0.2, 0.02), position=below)
+        up = entry("line", frame="hand", by=(0, 0, 0.05))
+        steps = [entry("attach", object="pad", link="hand"), up, entry("detach", object="pad"), up]
+        stopped = planner.sequence("home", steps, timeout=SECONDS).reason
+        assert "pad" in stopped and "floor" in stopped
+        allow = entry("allow", pairs=[("pad", "floor")])
+        steps = [allow, *steps[:2], {**allow, "contact": False}, *steps[2:]]
+        result = planner.sequence("home", steps, timeout=SECONDS)
+        assert result, result.reason
+        kinds = [step.kind for step in result.steps]
+        assert kinds == ["goal", "allow", "attach", "line", "allow", "detach", "line"]
+        assert [("floor", "pad") in step.allowed for step in result.steps] == [k in (1, 2, 3) for k in range(7)]
+        assert result.steps[2].grasped == result.steps[5].released == ("pad",)
+        left = next(one for one in result.steps[6].scene if one.name == "pad")
+        np.testing.assert_allclose(left.position, at + [0.0, 0.0, 0.02], atol=1e-3)
+
+
+def test_both_arms_go_at_once_each_along_its_own_line() -> None:
+    with MotionPlanner() as planner:
+        robot = planner.robot
+        lines = [
+            entry("line", frame="left_hand", by=(0.0, 0.0, 0.1)),
+            entry("line", frame="right_hand", by=(0.05, 0.0, -0.05)),
+        ]
+        result = planner.sequence("home", [entry("together", steps=lines)], timeout=SECONDS)
+        alone = [planner.sequence("home", [line], timeout=SECONDS) for line in lines]
+        assert result.trajectory is not None and len(result.steps) == 2
+        durations = [one.trajectory.duration for one in alone if one.trajectory is not None]
+        assert result.trajectory.duration == pytest.approx(max(durations))
+        for hand, step in zip(("left_hand", "right_hand"), lines, strict=True):
+            start, end = (planner.fk(q, hand) for q in (robot.home, result.trajectory.positions[-1]))
+            np.testing.assert_allclose(end[:3, 3] - start[:3, 3], step["by"], atol=2e-4)
+            for t in np.linspace(0.0, result.trajectory.duration, 9):
+                moved = planner.fk(result.trajectory(t), hand)[:3, 3] - start[:3, 3]
+                by = np.array(step["by"])
+                assert np.linalg.norm(moved - by * (moved @ by) / (by @ by)) < 1e-4
+        twice = planner.sequence("home", [entry("together", steps=[lines[0], lines[0]])], timeout=SECONDS)
+        assert not twice and "two of them move left_joint" in twice.reason
+
+
+def test_a_line_goes_onto_the_contact_face_of_an_obstacle() -> None:
+    with MotionPlanner("panda") as planner:
+        at = planner.fk("home", "hand")[:3, 3]
+        face = {"point": (0, 0, 0.05), "axis": (0, 0, 1)}
+        planner.world.add(name="post", box=(0.05, 0.05, 0.1), position=tuple(at - [0.03, 0.0, 0.2]), contact=face)
+        result = planner.sequence("home", [entry("line", frame="hand", onto="post", distance=0.02)], timeout=SECONDS)
+        assert result.trajectory is not None, result.reason
+        found = planner.fk(result.trajectory.positions[-1], "hand")
+        np.testing.assert_allclose(found[:3, 3], at - [0.03, 0.0, 0.13], atol=2e-4)
+
+
+def test_grasps_are_poses_of_the_hand_where_the_object_is() -> None:
+    robot, problem = load_robot("panda"), cached_problem("pick_and_place")
+    box = next(one for one in problem.scene if one.name == "box")
+    goal = Goal.model_validate({"grasp": {"object": "box", "hand": "hand", "remaining": (0.0, 0.0, 0.1)}})
+    found = pose_alternatives(robot, problem, goal)
+    assert len(found) == len(box.grasps) == cells.GRASPS
+    for (pose,), grasp in zip(found, box.grasps, strict=True):
+        hand = pin.SE3(pin.Quaternion(*np.roll(pose.orientation or DOWN, 1)), np.array(pose.position))
+        inside = pin.SE3(box.pose).inverse() * hand * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.1]))
+        np.testing.assert_allclose(inside.homogeneous, grasp.pose, atol=1e-7)
+    both = Goal.model_validate(
+        {"all_of": [{"any_of": [goal, goal]}, {"poses": [{"frame": "panda_link5", "position": (0, 0, 1)}]}]}
+    )
+    pairs = pose_alternatives(robot, problem, both)
+    assert len(pairs) == 2 * len(found) and {len(pair) for pair in pairs} == {2}
+    many = Goal.model_validate({"all_of": [{"any_of": [goal] * 20}, both.all_of[1] if both.all_of else goal]})
+    assert len(pose_alternatives(robot, problem, many)) == MOST
+
+
+@pytest.mark.parametrize(
+    "step, words",
+    [
+        ({"kind": "move", "goal": {"grasp": {"object": "cup", "hand": "hand"}}}, "expected an object: box"),
+        ({"kind": "move", "goal": {"grasp": {"object": "box", "hand": "paw"}}}, "expected a hand: hand"),
+        ({"kind": "move", "goal": {"grasp": {"object": "box", "hand": "hand"}}}, "expected an object with grasps"),
+        ({"kind": "attach", "object": "cup", "link": "hand"}, "after.0.object: expected an obstacle: box"),
+        ({"kind": "attach", "object": "box", "link": "foot"}, "expected a hand or a link of the robot"),
+        ({"kind": "detach", "object": "box"}, "expected a held object: there is none"),
+        ({"kind": "allow", "pairs": [["box", "wall"]]}, "expected links of the robot, or: box"),
+        ({"kind": "together", "steps": [{"kind": "wait", "seconds": 1.0}]}, "after.0.steps"),
+        ({"kind": "move", "goal": "hme"}, "did you mean 'home'"),
+        ({"kind": "line", "frame": "hand", "by": (0, 0, 0.1), "blend": -1.0}, "after.0.blend"),
+        (7, "steps[0]: expected a step such as"),
+    ],
+)  # fmt: skip
+def test_faulty_steps_are_named(step: Any, words: str) -> None:
+    with MotionPlanner("panda") as planner:
+        planner.world.add(name="box", box=(0.05, 0.05, 0.1), position=(0.5, -0.2, 0.3))
+        with pytest.raises(ApexError) as raised:
+            planner.sequence("home", [step])
+        assert words in str(raised.value)
+
+
+def test_a_sequence_is_planned_from_its_file_saved_and_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, out = tmp_path / "lift.yaml", tmp_path / "lift.npz"
+    home = {name: float(q) for name, q in zip(load_robot("panda").joint_names, load_robot("panda").home, strict=True)}
+    up = {"kind": "line", "frame": "hand", "by": [0.0, 0.0, 0.05], "blend": 0.02}
+    after = [up, {**up, "by": [0.0, 0.05, 0.0]}]
+    text = {"schema": "apex-ompl/problem/1", "name": "lift", "robot": "panda", "start": home, "after": after}
+    file.write_text(json.dumps(text))
+    assert main(["sequence", str(file), "--timeout", "30", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    found = load_result(out)
+    assert isinstance(found, TaskResult) and [step.kind for step in found.steps] == ["goal", "line", "line"]
+    assert "step       line hand" in shown and found.steps[1].blended
+    assert main(["plan", str(file), "--timeout", "30"]) == 0
+    assert "steps after the goal are left out" in capsys.readouterr().err
+
+
+def test_cells_are_the_same_by_seed() -> None:
+    for kind in cells.names():
+        assert cells.draw(kind, 3) == cells.draw(kind, 3) != cells.draw(kind, 4)
+        assert Problem.parse(cells.draw(kind, 3).as_dict(), "again") == cells.draw(kind, 3)
+    with pytest.raises(ApexError, match="kind of cell"):
+        cells.draw("sorting", 0)
