@@ -56,8 +56,7 @@ class SceneBodies:
             self.add(body)
         for held in attached:
             self.attach(held)
-        for pair in allowed:
-            self.allow(*pair)
+        self._allow_all(allowed, True)
 
     def become(
         self, scene: Mapping[str, Obstacle], held: Mapping[str, AttachedObject], allowed: Iterable[tuple[str, str]]
@@ -263,16 +262,22 @@ class SceneBodies:
             UnknownNameError: There is no such body.
             SceneError: Both names are of the same body.
         """
+        self._allow_all([(first, second)], allowed)
+
+    def _allow_all(self, pairs: Iterable[tuple[str, str]], allowed: bool) -> None:
+        """Let the bodies of pairs touch, or no longer."""
         links = {self.meshes.solids[k].name for k in range(self.meshes.links)}
-        for name in (first, second):
-            if not isinstance(name, str) or not any(
-                name in known for known in (self._obstacles, self._attached, links)
-            ):
-                raise UnknownNameError("body", name, (*self._obstacles, *self._attached, *sorted(links)))
-        if first == second:
-            raise SceneError(f"the body {first!r} is not checked against itself, expected two bodies")
-        pair = {frozenset((first, second))}
-        self._set_allowed(self.meshes.allowed | pair if allowed else self.meshes.allowed - pair)
+        changed = set[frozenset[str]]()
+        for pair in pairs:
+            for name in pair:
+                if not isinstance(name, str) or not any(
+                    name in known for known in (self._obstacles, self._attached, links)
+                ):
+                    raise UnknownNameError("body", name, (*self._obstacles, *self._attached, *sorted(links)))
+            if len(set(pair)) == 1:
+                raise SceneError(f"the body {pair[0]!r} is not checked against itself, expected two bodies")
+            changed.add(frozenset(pair))
+        self._set_allowed(self.meshes.allowed | changed if allowed else self.meshes.allowed - changed)
 
     def _forget_allowed(self, name: str) -> None:
         """Remove the pairs of a body that is gone."""

@@ -401,6 +401,8 @@ class MotionCost(NamedTuple):
         limits: Limits of velocity, acceleration and jerk times the knot spacing, its square and cube, shape (3, dof).
         limit_weight: Weight of half the square of what they are exceeded by, as a share.
         settings: Margins, stiffness and steps.
+        given: Values at the samples of joints that follow a given motion, NaN of all others, shape (N, dof); without
+            such joints (0, dof).
     """
 
     grid: PathGrid
@@ -408,6 +410,7 @@ class MotionCost(NamedTuple):
     limits: Array
     limit_weight: float
     settings: CostSettings
+    given: Array
 
 
 def optimize_motion(
@@ -429,7 +432,7 @@ def optimize_motion(
     slope = np.empty(slopes)
     report = motion_optimization.optimize_motion(
         *kernel.packed, *dynamic, *kernel.workspace(), _places(dynamic), *cost.grid, cost.times, cost.limits,
-        float(cost.limit_weight), pinned, control, tuple(cost.settings), *optimization_buffers(pinned, *control.shape),
+        float(cost.limit_weight), compact(cost.given), pinned, control, tuple(cost.settings), *optimization_buffers(pinned, *control.shape),
         slope,
     )  # fmt: skip
     return PathReport(*report), slope
