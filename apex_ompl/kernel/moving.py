@@ -33,6 +33,7 @@ Packed = tuple[Any, ...]
 """Packed dynamic obstacles."""
 
 SAMPLE_WIDTH = motion_optimization.WIDTH  # control points of a spline in time that a sample depends on
+MOST_SPANS = compiled_intervals.MOST_SPANS  # blocked intervals of a place
 
 
 class LimitArrays(NamedTuple):
@@ -131,7 +132,7 @@ def blocked_intervals(
     Returns:
         The intervals of each piece in order, shape (P, most, 2) [s], and their numbers, shape (P,).
     """
-    spans = np.zeros((len(places), compiled_intervals.MOST_SPANS, 2))
+    spans = np.zeros((len(places), MOST_SPANS, 2))
     counts, (start, end) = np.empty(len(places), np.int64), window
     compiled_intervals.blocked_intervals(
         *kernel.robot.packed, *dynamic, *kernel.workspace(), curve.knots, curve.states, curve.rates,
