@@ -293,7 +293,7 @@ class MotionPlanner:
             from apex_ompl.apex.parameters import NAME
             from apex_ompl.collision.conservative import CheckCounts
             from apex_ompl.ompl.process import Interrupt, quiet_ompl, seed_ompl
-            from apex_ompl.planning import motions, steps, while_executing
+            from apex_ompl.planning import among_dynamic_obstacles, motions, steps, while_executing
             from apex_ompl.timing import Timing
 
         options.check()
@@ -314,6 +314,7 @@ class MotionPlanner:
                 checker = self._checker_without(self._absent())
                 checker.check_counts = CheckCounts()
                 motions.warm_up(checker)
+                among_dynamic_obstacles.warm_up(checker)
                 seed_ompl(options.seed)
 
             def query_of(setup: PlanningSetup) -> PlanQuery:
