@@ -27,7 +27,7 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.timing.trajectory import joined
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
-from apex_ompl.util.validation import check_name, check_number, check_positive, check_seed
+from apex_ompl.util.validation import check_integer, check_name, check_number, check_positive, check_seed
 
 if TYPE_CHECKING:
     from apex_ompl.planning.planner import MotionPlanner
@@ -153,7 +153,7 @@ class _Node:
 
 def schedule(
     planner: MotionPlanner, start: State, steps: Sequence[ArmStep], *, timeout: float = 10.0, seed: int = 0,
-    mode: Mode = "asynchronous", **options: Any,
+    mode: Mode = "asynchronous", most_plans: int | None = None, **options: Any,
 ) -> Schedule:  # fmt: skip
     """Return the schedule with the shortest makespan that is found in a time.
 
@@ -165,6 +165,7 @@ def schedule(
         seed: Seed of the plans and of the orders.
         mode: When motions start: ``asynchronous``, as soon as what they need is done; ``synchronous``, those of all arms
             together, when all have ended; ``sequential``, one at a time.
+        most_plans: Number of planned motions after which no further order is begun; by default time alone ends that.
         **options: Further ones of :meth:`apex_ompl.MotionPlanner.plan`.
 
     Raises:
@@ -173,7 +174,10 @@ def schedule(
     check_positive(timeout, "timeout", "a positive number of seconds")
     check_seed(seed)
     check_name(mode, "mode", MODES)
-    search = _Search(planner, start, steps, mode, seed, options, time.perf_counter() + timeout)
+    if most_plans is not None:
+        check_integer(most_plans, "most_plans", 1)
+    until = time.perf_counter() + timeout
+    search = _Search(planner, start, steps, mode, seed, options, until, most_plans=most_plans)
     with planner.world.locked():
         best = search.best()
         return search.schedule(best)
@@ -216,10 +220,12 @@ class _Search:
     def __init__(
         self, planner: MotionPlanner, start: State, steps: Sequence[ArmStep], mode: Mode, seed: int,
         options: Mapping[str, Any], until: float, root: _Node | None = None,
+        *, most_plans: int | None = None,
     ) -> None:  # fmt: skip
         """Check the steps, which are added to those of ``root``."""
         robot = planner.robot
         self._planner, self._mode, self._seed, self._options, self._until = planner, mode, seed, options, until
+        self._most_plans = np.inf if most_plans is None else most_plans
         known = () if root is None else root.done
         _check_steps(steps, known)
         values = joint_values(robot, start, "start")
@@ -247,7 +253,7 @@ class _Search:
             node = self._descent(rng if best is not None or self.orders else None, best)
             if node is not None and (best is None or node.end < best.end - LEAST_GAIN):
                 best = node
-            if time.perf_counter() >= self._until:
+            if self._over():
                 break
         return best
 
@@ -267,13 +273,13 @@ class _Search:
                 self._close(order)
                 self.orders += 1
                 return node
-            if best is not None and (node.end >= best.end - LEAST_GAIN or time.perf_counter() >= self._until):
+            if best is not None and (node.end >= best.end - LEAST_GAIN or self._over()):
                 self._close(order)
                 return None
             choices = [group for group in self._choices(node, order) if (*order, group) not in self._closed]
             if not choices:
                 self._close(order)
-                if time.perf_counter() >= self._until:
+                if self._over():
                     return None
                 order = order[:-1]
                 if () in self._closed:
@@ -281,6 +287,10 @@ class _Search:
                 continue
             pick = 0 if rng is None or rng.random() < GREEDY else int(rng.integers(len(choices)))
             order = self._entered(order, choices[pick])
+
+    def _over(self) -> bool:
+        """Whether no further order is begun."""
+        return time.perf_counter() >= self._until or self.plans >= self._most_plans
 
     def _close(self, order: tuple[str, ...]) -> None:
         self._closed.add(order)
