@@ -17,9 +17,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
@@ -53,6 +55,7 @@ MOST_TIMES = 400  # largest number of these
 SOON = 1e-3  # first time at which a place that is free at the start may be blocked [s]
 GROWN = (1, 3)  # cells in time by which blocked ones grow, in turn
 SAMPLES = 48  # states that are checked before a motion is proved
+SAME_PLACE = 1e-6  # of links that do not move [m]
 SAME_START = 1e-6  # largest difference of a start from the given motion [rad]
 DEVIATION = 1.5e-3  # of a retimed motion from its path [rad]
 SLOWER = 1.05  # than without the given motion, up to which no other motion is sought
@@ -300,18 +303,29 @@ def _with_goals(problem: Problem, states: Sequence[Mapping[str, float]]) -> Prob
 
 
 def without_given(checker: CollisionChecker, given: GivenMotion) -> CollisionChecker:
-    """Return a checker in which what the given joints move may touch all other bodies of the robot and what they hold."""
-    robot, held = checker.robot, checker.held
-    home, links = robot.home, sorted({checker.meshes.solids[k].name for k in range(checker.meshes.links)})
-    moved = set[str]()
-    for column in given.columns:
-        other = home.copy()
-        other[column] = robot.limits.lower[column] if home[column] > robot.limits.lower[column] else home[column] + 0.1
-        moved |= {link for link in links if not np.allclose(robot.link_pose(home, link), robot.link_pose(other, link))}
-    given_bodies = [link for link in links if link in moved] + [n for n, one in held.items() if one.link in moved]
-    others = [link for link in links if link not in moved] + [n for n, one in held.items() if one.link not in moved]
-    pairs = [*checker.allowed, *((one, other) for one in given_bodies for other in others)]
-    return CollisionChecker(robot, checker.obstacles.values(), held.values(), pairs)
+    """Return a checker in which what the given joints move may touch the rest of the robot and what that holds."""
+    links, held = sorted({checker.meshes.solids[k].name for k in range(checker.meshes.links)}), checker.held
+    moved = moved_links(checker.robot, tuple(given.columns.tolist()))
+    own = [link for link in links if link in moved] + [name for name, one in held.items() if one.link in moved]
+    others = [link for link in links if link not in moved] + [name for name in held if name not in own]
+    pairs = [*checker.allowed, *((one, other) for one in own for other in others)]
+    return CollisionChecker(checker.robot, checker.obstacles.values(), held.values(), pairs)
+
+
+@lru_cache(maxsize=16)
+def moved_links(robot: Robot, columns: tuple[int, ...]) -> frozenset[str]:
+    """Return the links that some joints move."""
+    states = np.tile(robot.home, (len(columns) + 1, 1))
+    for row, column in enumerate(columns):
+        near = robot.home[column] - robot.limits.lower[column] > robot.limits.upper[column] - robot.home[column]
+        states[row, column] = robot.limits.lower[column] if near else robot.limits.upper[column]
+    data, numbers = robot.model.createData(), {link: robot.link_frame(link) for link in robot.link_names}
+    places = list[Array]()
+    for q in states:
+        pin.framesForwardKinematics(robot.model, data, robot.to_pinocchio(q))
+        places.append(np.array([data.oMf[k].homogeneous for k in numbers.values()]))
+    moves = (np.abs(np.array(places[:-1]) - places[-1]) > SAME_PLACE).any(axis=(0, 2, 3))
+    return frozenset(link for link, one in zip(numbers, moves, strict=True) if one)
 
 
 class _Places:

@@ -2,7 +2,7 @@
 
 Two kinds of cells are drawn by seed, for two Pandas with hands above their tables. In ``transfer``, the left arm takes
 parts from its side and puts them down in the middle, from where the right arm takes each to its own side: the right arm
-waits for each part, and the left one until the place is empty again. In ``crossing``, both arms visit places all over the
+waits for each part, and the left one until the part before has been taken. In ``crossing``, both arms visit places all over the
 cell, the middle among them, and wait for nothing. An arm stays 0.3 s at each place. All rows have the same steps, goal
 states, planner, seed and number of planned motions.
 
@@ -36,13 +36,12 @@ DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/moving")
 FOLDER = RUNS / "schedules"
 KINDS = ("transfer", "crossing")
 SEEDS = {"test": 900_000, "validation": 800_000}
-SIDES = {"left": 1.0, "right": -1.0}
 PARTS = 3  # that are handed over in a cell; visits of each arm in the other kind are twice as many
 HOLD = 0.3  # at each place [s]
 OWN = np.array([0.3, 0.3, 0.25]), np.array([0.6, 0.7, 0.55])  # places on the left arm's side [m]
 MIDDLE = np.array([0.4, -0.1, 0.3]), np.array([0.6, 0.1, 0.5])
-NEAR = 0.12  # of two places in the middle of a transfer: the part's height and width [m]
-MOST_PLANS = 80  # of each schedule
+SIDES = {"left": (OWN, MIDDLE), "right": (MIDDLE, OWN)}  # where each arm takes a part, and puts it
+MOST_PLANS = 60  # of each schedule
 TIMEOUT = 600.0  # so that the number of plans ends the search, and not a busy machine [s]
 SAMPLE = 0.001  # of the check [s]
 HEAD = (
@@ -55,7 +54,7 @@ HEAD = (
 def places(rng: np.random.Generator, side: str, where: tuple[Array, Array]) -> Array:
     """Return a random place of a hand, mirrored to the arm's side, shape (3,) [m]."""
     x, y, z = rng.uniform(*where)
-    return np.array([x, y * SIDES[side], z])
+    return np.array([x, y if side == "left" else -y, z])
 
 
 def reached(planner: MotionPlanner, rng: np.random.Generator, side: str, where: tuple[Array, Array]) -> dict[str, float]:
@@ -73,20 +72,19 @@ def cell(planner: MotionPlanner, kind: str, seed: int) -> list[ArmStep]:
     """Return the steps of a random cell."""
     rng, steps = np.random.default_rng([seed, KINDS.index(kind)]), list[ArmStep]()
     for k in range(PARTS):
-        for side, first, second in (("left", OWN, MIDDLE), ("right", MIDDLE, OWN)):
-            goals = [reached(planner, rng, side, where) for where in (first, second)]
+        for side, ends in SIDES.items():
+            first, second = (reached(planner, rng, side, where) for where in ends)
             if kind == "crossing" and rng.random() < 0.5:
-                goals.reverse()
-            waits: dict[int, tuple[str, ...]] = {}
+                first, second = second, first
+            take, put = tuple[str, ...](), tuple[str, ...]()
             if kind == "transfer" and side == "right":
-                waits = {0: (f"left {k} away",)}
+                take = (f"left {k} put",)
             if kind == "transfer" and side == "left" and k:
-                waits = {1: (f"right {k - 1} put",)}
-            ends = ("take", "put")
-            for n, (goal, end) in enumerate(zip(goals, ends, strict=True)):
-                steps.append(ArmStep(f"{side} {k} {end}", f"{side}_arm", goal, waits.get(n, ()), HOLD))
-            if kind == "transfer" and side == "left":
-                steps.append(ArmStep(f"left {k} away", "left_arm", reached(planner, rng, side, OWN)))
+                put = (f"right {k - 1} take",)
+            steps.append(ArmStep(f"{side} {k} take", f"{side}_arm", first, take, HOLD))
+            steps.append(ArmStep(f"{side} {k} put", f"{side}_arm", second, put, HOLD))
+    if kind == "transfer":
+        steps.append(ArmStep("left away", "left_arm", reached(planner, rng, "left", OWN)))
     return steps
 
 
