@@ -433,8 +433,8 @@ def optimize_motion(
     slope = np.empty(slopes)
     report = motion_optimization.optimize_motion(
         *kernel.packed, *dynamic, *kernel.workspace(), _places(dynamic), *cost.grid, cost.times, cost.limits,
-        float(cost.limit_weight), compact(cost.given), pinned, control, tuple(cost.settings), *optimization_buffers(pinned, *control.shape),
-        slope,
+        float(cost.limit_weight), compact(cost.given), pinned, control, tuple(cost.settings),
+        *optimization_buffers(pinned, *control.shape), slope,
     )  # fmt: skip
     return PathReport(*report), slope
 

@@ -152,7 +152,9 @@ def retime(
     return retime_around(find, motion, limits, query)
 
 
-def retime_around(find: Callable[[Array, float, float], Blocked], motion: Trajectory, limits: Limits, query: Query) -> Retimed:
+def retime_around(
+    find: Callable[[Array, float, float], Blocked], motion: Trajectory, limits: Limits, query: Query
+) -> Retimed:
     """Return the motion along the remaining path that arrives first where places are blocked at known times.
 
     Args:

@@ -149,7 +149,9 @@ class MotionPlanner:
         with running(), self._lock:
             given = PlanOptions(group=group, **options)
             if while_executing is not None:
-                return self._plan_while(start, goal, planner, started, given, name, while_executing, offset)
+                return self._plan_while(
+                    start, goal, planner, started, given, name=name, motion=while_executing, offset=offset
+                )
             problem = self.problem(start, goal, name, group, given.seed)
             _check_is_no_line(problem)
             return self._plan(problem, planner, started, given)
@@ -285,8 +287,8 @@ class MotionPlanner:
             return result
 
     def _plan_while(
-        self, start: State, goal: Target, planner: AnyPlanner | None, started: float, options: PlanOptions, name: str,
-        motion: Trajectory, offset: float,
+        self, start: State, goal: Target, planner: AnyPlanner | None, started: float, options: PlanOptions, *,
+        name: str, motion: Trajectory, offset: float,
     ) -> PlanResult:  # fmt: skip
         """Plan while other joints execute a motion, while the lock is held; see :meth:`plan`."""
         with unforked():

@@ -1,17 +1,17 @@
 """Schedules of several arms: each arm has a list of motions, and a motion waits only for those that it needs.
 
 Motions are planned one after the other, each while the other arms execute what is planned of theirs
-(:mod:`apex_ompl.planning.while_executing`), from the earliest time at which it may start. In which order they are planned
-decides on who gives way; orders are tried within the time given, and the one with the shortest makespan is taken. The
-first is greedy: next is the arm that may start soonest.
+(:mod:`apex_ompl.planning.while_executing`), from the earliest time at which it may start. The order in which they are
+planned decides on who gives way; orders are tried within the time given, and the one with the shortest makespan is
+taken. The first is greedy: next is the arm that may start soonest.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import digest
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.trajectory import joined
-from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_integer, check_name, check_number, check_positive, check_seed
 
@@ -34,10 +33,11 @@ if TYPE_CHECKING:
     from apex_ompl.planning.query import State
 
 Mode = Literal["asynchronous", "synchronous", "sequential"]
-MODES = ("asynchronous", "synchronous", "sequential")
+MODES: tuple[Mode, ...] = ("asynchronous", "synchronous", "sequential")
 """When a motion starts: as soon as what it needs is done; with those of the other arms; when all others have ended."""
 
 PLAN_SECONDS = 2.0  # largest time for one motion [s]
+MOST_FAULTS = 3  # that a reason gives
 GREEDY = 0.5  # share of choices that are greedy after the first order
 LEAST_GAIN = 1e-6  # of a makespan [s]
 PATH_SPACING = 0.02  # of the states of the path along the whole motion [s]
@@ -161,10 +161,10 @@ def schedule(
         planner: The planner with its world.
         start: The start of all joints.
         steps: The steps; those of a group are done in their order.
-        timeout: Seconds for the schedule; the first complete order is finished all the same, each of its motions in 2 s.
+        timeout: Seconds for the schedule; the first order is finished all the same, each of its motions in 2 s.
         seed: Seed of the plans and of the orders.
-        mode: When motions start: ``asynchronous``, as soon as what they need is done; ``synchronous``, those of all arms
-            together, when all have ended; ``sequential``, one at a time.
+        mode: When motions start: ``asynchronous``, as soon as what they need is done; ``synchronous``, those of all
+            arms together, when all have ended; ``sequential``, one at a time.
         most_plans: Number of planned motions after which no further order is begun; by default time alone ends that.
         **options: Further ones of :meth:`apex_ompl.MotionPlanner.plan`.
 
@@ -177,7 +177,8 @@ def schedule(
     if most_plans is not None:
         check_integer(most_plans, "most_plans", 1)
     until = time.perf_counter() + timeout
-    search = _Search(planner, start, steps, mode, seed, options, until, most_plans=most_plans)
+    how = _How(mode, seed, options, until, np.inf if most_plans is None else most_plans)
+    search = _Search(planner, start, steps, how)
     with planner.world.locked():
         best = search.best()
         return search.schedule(best)
@@ -209,23 +210,38 @@ def replaced(
     kept = tuple(step for step in known.steps if step.group != group or step.end <= end)
     motions = {**known.motions, group: known.motions[group].before(end)}
     first = known.result.problem.start_state(planner.robot.joint_names)
-    search = _Search(planner, first, steps, "asynchronous", seed, options, np.inf, _Node(motions, kept))
+    search = _Search(planner, first, steps, _How("asynchronous", seed, options), _Node(motions, kept))
     with planner.world.locked():
         return search.schedule(search.best())
+
+
+class _How(NamedTuple):
+    """How a schedule is searched for.
+
+    Attributes:
+        mode: When motions start.
+        seed: Seed of the plans and of the orders.
+        options: Options of plans.
+        until: Value of ``time.perf_counter`` at which no further order is begun [s].
+        most_plans: Number of plans after which none is.
+    """
+
+    mode: Mode
+    seed: int
+    options: Mapping[str, Any]
+    until: float = np.inf
+    most_plans: float = np.inf
 
 
 class _Search:
     """Search of the order in which steps are planned."""
 
     def __init__(
-        self, planner: MotionPlanner, start: State, steps: Sequence[ArmStep], mode: Mode, seed: int,
-        options: Mapping[str, Any], until: float, root: _Node | None = None,
-        *, most_plans: int | None = None,
-    ) -> None:  # fmt: skip
+        self, planner: MotionPlanner, start: State, steps: Sequence[ArmStep], how: _How, root: _Node | None = None
+    ) -> None:
         """Check the steps, which are added to those of ``root``."""
         robot = planner.robot
-        self._planner, self._mode, self._seed, self._options, self._until = planner, mode, seed, options, until
-        self._most_plans = np.inf if most_plans is None else most_plans
+        self._planner, self._how = planner, how
         known = () if root is None else root.done
         _check_steps(steps, known)
         values = joint_values(robot, start, "start")
@@ -248,7 +264,7 @@ class _Search:
 
     def best(self) -> _Node | None:
         """Return the node of the best complete order, or None."""
-        rng, best = np.random.default_rng(self._seed), None
+        rng, best = np.random.default_rng(self._how.seed), None
         while () not in self._closed:
             node = self._descent(rng if best is not None or self.orders else None, best)
             if node is not None and (best is None or node.end < best.end - LEAST_GAIN):
@@ -290,7 +306,7 @@ class _Search:
 
     def _over(self) -> bool:
         """Whether no further order is begun."""
-        return time.perf_counter() >= self._until or self.plans >= self._most_plans
+        return time.perf_counter() >= self._how.until or self.plans >= self._how.most_plans
 
     def _close(self, order: tuple[str, ...]) -> None:
         self._closed.add(order)
@@ -321,9 +337,9 @@ class _Search:
         """Return when a step starts [s], and the round that it belongs to: its start and the groups that move."""
         needs, own = node.ends_of(step.after), node.motions[step.group].duration
         assert needs is not None
-        if self._mode == "asynchronous":
+        if self._how.mode == "asynchronous":
             return max(own, needs), 0.0, frozenset()
-        in_round = self._mode == "synchronous" and step.group not in node.moved
+        in_round = self._how.mode == "synchronous" and step.group not in node.moved
         if in_round and max(own, needs) <= node.clock:
             return node.clock, node.clock, node.moved | {step.group}
         return node.end, node.end, frozenset({step.group})
@@ -338,9 +354,9 @@ class _Search:
         for motion in (own, *others):
             now |= dict(zip(motion.joint_names, motion(begin).tolist(), strict=True))
         beside = together(others) if others and max(m.duration for m in others) > begin else None
-        left = max(self._until - time.perf_counter(), 0.1) if self.orders else PLAN_SECONDS
+        left = max(self._how.until - time.perf_counter(), 0.1) if self.orders else PLAN_SECONDS
         given: dict[str, Any] = {} if beside is None else {"while_executing": beside, "offset": begin}
-        options = {"timeout": min(PLAN_SECONDS, left), "seed": self._seed, **self._options, **given}
+        options = {"timeout": min(PLAN_SECONDS, left), "seed": self._how.seed, **self._how.options, **given}
         self.plans += 1
         result = self._planner.plan(now, step.goal, group=group, **options)
         if not result or result.trajectory is None:
@@ -356,19 +372,19 @@ class _Search:
         reached = node if node is not None else self._nodes[()]
         assert isinstance(reached, _Node)
         planner, robot = self._planner, self._planner.robot
-        motion = GivenMotion.of(robot, together([*reached.motions.values()])).combined(
-            rest(self.start, 0.0, robot.joint_names)
-        )
+        still = rest(self.start, 0.0, robot.joint_names)
+        motion = GivenMotion.of(robot, together([*reached.motions.values()])).combined(still)
         problem = planner.problem(motion.positions[0], motion.positions[-1], "schedule")
+        faults = [*dict.fromkeys(self.faults)][-MOST_FAULTS:]
         result = PlanResult(
-            status=PlanStatus.TIMEOUT, reason="no order of the steps is possible: " + "; ".join(dict.fromkeys(self.faults)),
-            problem=problem, robot=robot.name, joint_names=robot.joint_names, planner="schedule", seed=self._seed,
+            status=PlanStatus.TIMEOUT, reason=f"no order of the steps was found: {'; '.join(faults)}",
+            problem=problem, robot=robot.name, joint_names=robot.joint_names, planner="schedule", seed=self._how.seed,
             robot_digest=digest(robot),
         )  # fmt: skip
         if node is not None:
             result = self._proved(replace(result, reason=""), motion)
         steps = tuple(sorted(reached.done, key=lambda step: (step.start, step.end))) if node is not None else ()
-        return Schedule(result, steps, dict(reached.motions), self._mode, self.orders, self.plans)
+        return Schedule(result, steps, dict(reached.motions), self._how.mode, self.orders, self.plans)
 
     def _proved(self, result: PlanResult, motion: Trajectory) -> PlanResult:
         """Return a result with its motion, where the full check accepts it."""
@@ -379,7 +395,7 @@ class _Search:
         path = Path(motion(np.linspace(0.0, motion.duration, max(2, int(motion.duration / PATH_SPACING)))))
         return replace(
             result, status=PlanStatus.EXACT_SOLUTION, path=path, length=path.length, trajectory=motion,
-            solved_by=self._mode, timing_method="schedule", limit_use=motion.use(self._planner.robot.limits),
+            solved_by=self._how.mode, timing_method="schedule", limit_use=motion.use(self._planner.robot.limits),
             motion_clearance=check.proof.clearance, **certificate(check.proof),
         )  # fmt: skip
 
@@ -393,7 +409,7 @@ def _check_steps(steps: Sequence[ArmStep], known: Sequence[ScheduledStep]) -> No
     """
     if not steps or not all(isinstance(step, ArmStep) for step in steps):
         raise ParameterError("steps", steps, "one ArmStep or more")
-    names = [step.name for step in (*known, *steps)]
+    names = [*(step.name for step in known), *(step.name for step in steps)]
     for name in names:
         if names.count(name) > 1:
             raise ParameterError("steps", f"two steps {name!r}", "names that differ")

@@ -1,15 +1,15 @@
 """Plans of some joints while others execute a known motion: a state in time is (own, given(t)).
 
-1. A path is planned as if the given joints and what they move were not there, and timed. Where its motion, together with
-   the given one, is proved, it is the plan.
-2. Otherwise the motion is retimed: it waits, slows down or speeds up along its path (:mod:`apex_ompl.moving.retime`). The
-   times at which each place of the path is blocked are found at a grid of states. The same is done along a path that is
-   free where the given motion has ended.
-3. Motions are optimized in space and time (:mod:`apex_ompl.moving.motion_optimizer`), with the given values of the others
-   at each sample; not under constraints.
+1. A path is planned as if the given joints and what they move were not there, and timed. Where its motion, together
+   with the given one, is proved, it is the plan.
+2. Otherwise the motion is retimed: it waits, slows down or speeds up along its path (:mod:`apex_ompl.moving.retime`).
+   The times at which each place of the path is blocked are found at a grid of states. The same is done along a path
+   that is free where the given motion has ended.
+3. Motions are optimized in space and time (:mod:`apex_ompl.moving.motion_optimizer`), with the given values of the
+   others at each sample; not under constraints.
 
-The motion that arrives first is taken. Each is proved by the full check of the motion of all joints, so that the robot is
-checked against itself along both.
+The motion that arrives first is taken. Each is proved by the full check of the motion of all joints, so that the robot
+is checked against itself along both.
 """
 
 from __future__ import annotations
@@ -242,9 +242,7 @@ def plan_while_executing(
     return _unsolved(query, began, PlanStatus.TIMEOUT, reason)
 
 
-def _in_time(
-    context: WhileExecuting, still: PlanResult, at_rest: PlanningSetup, simplify: bool
-) -> PlanResult | None:
+def _in_time(context: WhileExecuting, still: PlanResult, at_rest: PlanningSetup, simplify: bool) -> PlanResult | None:
     """Return the result with the motion that arrives first, or None.
 
     Args:
@@ -298,7 +296,7 @@ def _unsolved(query: PlanQuery, problem: Problem, status: PlanStatus, reason: st
     return replace(finish(query, FoundPath(query, status, reason).result()), problem=problem)
 
 
-def _with_goals(problem: Problem, states: Sequence[Mapping[str, float]]) -> Problem:
+def _with_goals(problem: Problem, states: Sequence[dict[str, float]]) -> Problem:
     return problem.model_copy(update={"goal": Goal(joints=tuple(states))})
 
 
@@ -324,8 +322,8 @@ def moved_links(robot: Robot, columns: tuple[int, ...]) -> frozenset[str]:
     for q in states:
         pin.framesForwardKinematics(robot.model, data, robot.to_pinocchio(q))
         places.append(np.array([data.oMf[k].homogeneous for k in numbers.values()]))
-    moves = (np.abs(np.array(places[:-1]) - places[-1]) > SAME_PLACE).any(axis=(0, 2, 3))
-    return frozenset(link for link, one in zip(numbers, moves, strict=True) if one)
+    moves = np.abs(np.array(places[:-1]) - places[-1]).max(axis=(0, 2, 3), initial=0.0) > SAME_PLACE
+    return frozenset(link for link, one in zip(numbers, moves.tolist(), strict=True) if one)
 
 
 class _Places:
@@ -348,7 +346,7 @@ class _Places:
             if not np.isin(edges, self._edges).all():
                 self._edges, self._free = edges, self._examined(edges)
             rows = np.searchsorted(self._edges, places)
-            return self._spans(places, ~self._free[rows].all(axis=1), grown, end)
+            return self._spans(places, np.logical_not(self._free[rows]).any(axis=1), grown, end)
 
         return find
 

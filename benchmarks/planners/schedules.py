@@ -1,10 +1,10 @@
-"""Two arms with steps of their own: makespans of asynchronous, synchronous and sequential schedules, and their contacts.
+"""Two arms with steps of their own: makespans of asynchronous, synchronous and sequential schedules, and contacts.
 
 Two kinds of cells are drawn by seed, for two Pandas with hands above their tables. In ``transfer``, the left arm takes
 parts from its side and puts them down in the middle, from where the right arm takes each to its own side: the right arm
-waits for each part, and the left one until the part before has been taken. In ``crossing``, both arms visit places all over the
-cell, the middle among them, and wait for nothing. An arm stays 0.3 s at each place. All rows have the same steps, goal
-states, planner, seed and number of planned motions.
+waits for each part, and the left one until the part before has been taken. In ``crossing``, both arms visit places on
+their side and in the middle, and wait for nothing. An arm stays 0.1 to 1 s at each place. All rows have the same steps,
+goal states, planner, seed and largest number of planned motions.
 
 Each asynchronous schedule is checked anew at samples 1 ms apart by Coal on the meshes, without sphere covers. Cells are
 kept in benchmarks/runs/schedules when they are done; the command resumes.
@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from apex_ompl import MotionPlanner, PoseTarget, Trajectory
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.planning.schedule import MODES, ArmStep, Schedule, schedule
+from apex_ompl.planning.schedule import MODES, ArmStep, schedule
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
@@ -37,7 +37,7 @@ FOLDER = RUNS / "schedules"
 KINDS = ("transfer", "crossing")
 SEEDS = {"test": 900_000, "validation": 800_000}
 PARTS = 3  # that are handed over in a cell; visits of each arm in the other kind are twice as many
-HOLD = 0.3  # at each place [s]
+HOLD = 0.1, 1.0  # at each place [s]
 OWN = np.array([0.3, 0.3, 0.25]), np.array([0.6, 0.7, 0.55])  # places on the left arm's side [m]
 MIDDLE = np.array([0.4, -0.1, 0.3]), np.array([0.6, 0.1, 0.5])
 SIDES = {"left": (OWN, MIDDLE), "right": (MIDDLE, OWN)}  # where each arm takes a part, and puts it
@@ -57,7 +57,9 @@ def places(rng: np.random.Generator, side: str, where: tuple[Array, Array]) -> A
     return np.array([x, y if side == "left" else -y, z])
 
 
-def reached(planner: MotionPlanner, rng: np.random.Generator, side: str, where: tuple[Array, Array]) -> dict[str, float]:
+def reached(
+    planner: MotionPlanner, rng: np.random.Generator, side: str, where: tuple[Array, Array]
+) -> dict[str, float]:
     """Return joint values of an arm with its hand at a random place; places without such a state are drawn again."""
     names = [planner.robot.joint_names[k] for k in planner.robot.groups[f"{side}_arm"]]
     while True:
@@ -81,10 +83,10 @@ def cell(planner: MotionPlanner, kind: str, seed: int) -> list[ArmStep]:
                 take = (f"left {k} put",)
             if kind == "transfer" and side == "left" and k:
                 put = (f"right {k - 1} take",)
-            steps.append(ArmStep(f"{side} {k} take", f"{side}_arm", first, take, HOLD))
-            steps.append(ArmStep(f"{side} {k} put", f"{side}_arm", second, put, HOLD))
-    if kind == "transfer":
-        steps.append(ArmStep("left away", "left_arm", reached(planner, rng, "left", OWN)))
+            for name, goal, after in (("take", first, take), ("put", second, put)):
+                steps.append(ArmStep(f"{side} {k} {name}", f"{side}_arm", goal, after, float(rng.uniform(*HOLD))))
+    for side in SIDES:
+        steps.append(ArmStep(f"{side} away", f"{side}_arm", reached(planner, rng, side, OWN)))
     return steps
 
 
@@ -100,9 +102,7 @@ def examined(planner: MotionPlanner, kind: str, seed: int) -> dict[str, Any]:
     steps, found = cell(planner, kind, seed), dict[str, Any]()
     for mode in MODES:
         started = time.process_time()
-        made: Schedule = schedule(
-            planner, "home", steps, timeout=TIMEOUT, seed=seed, mode=mode, most_plans=MOST_PLANS
-        )  # type: ignore[arg-type]
+        made = schedule(planner, "home", steps, timeout=TIMEOUT, seed=seed, mode=mode, most_plans=MOST_PLANS)
         found[mode] = {
             "solved": bool(made), "makespan": made.makespan if made else None, "reason": made.reason,
             "orders": made.orders, "plans": made.plans, "seconds": time.process_time() - started,
