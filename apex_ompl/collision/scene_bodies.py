@@ -10,7 +10,7 @@ from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.shapes import coal_geometry, extent_in_link, mesh_note, with_file_read, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
+from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid, size_note
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line, progress
@@ -109,7 +109,7 @@ class SceneBodies:
 
     @property
     def mesh_notes(self) -> tuple[str, ...]:
-        """Sentences on meshes that are no proper solids, and how they are interpreted."""
+        """Sentences on meshes that are no proper solids, and how they are interpreted, and on very long bodies."""
         return tuple(self._notes.values())
 
     def obstacle(self, name: str) -> Obstacle:
@@ -148,7 +148,7 @@ class SceneBodies:
         obstacle = with_file_read(obstacle)
         self.meshes.add(obstacle.name, *world_geometry(obstacle))
         self._put(obstacle)
-        if note := mesh_note(obstacle):
+        if note := mesh_note(obstacle) or size_note(obstacle):
             self._notes[obstacle.name] = note
         self._obstacles_changed()
 
