@@ -10,7 +10,7 @@ from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.shapes import coal_geometry, extent_in_link, mesh_note, with_file_read, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
+from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid, size_note
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line, progress
@@ -56,8 +56,7 @@ class SceneBodies:
             self.add(body)
         for held in attached:
             self.attach(held)
-        for pair in allowed:
-            self.allow(*pair)
+        self._allow_all(allowed, True)
 
     def become(
         self, scene: Mapping[str, Obstacle], held: Mapping[str, AttachedObject], allowed: Iterable[tuple[str, str]]
@@ -110,7 +109,7 @@ class SceneBodies:
 
     @property
     def mesh_notes(self) -> tuple[str, ...]:
-        """Sentences on meshes that are no proper solids, and how they are interpreted."""
+        """Sentences on meshes that are no proper solids, and how they are interpreted, and on very long bodies."""
         return tuple(self._notes.values())
 
     def obstacle(self, name: str) -> Obstacle:
@@ -149,7 +148,7 @@ class SceneBodies:
         obstacle = with_file_read(obstacle)
         self.meshes.add(obstacle.name, *world_geometry(obstacle))
         self._put(obstacle)
-        if note := mesh_note(obstacle):
+        if note := mesh_note(obstacle) or size_note(obstacle):
             self._notes[obstacle.name] = note
         self._obstacles_changed()
 
@@ -263,16 +262,22 @@ class SceneBodies:
             UnknownNameError: There is no such body.
             SceneError: Both names are of the same body.
         """
+        self._allow_all([(first, second)], allowed)
+
+    def _allow_all(self, pairs: Iterable[tuple[str, str]], allowed: bool) -> None:
+        """Let the bodies of pairs touch, or no longer."""
         links = {self.meshes.solids[k].name for k in range(self.meshes.links)}
-        for name in (first, second):
-            if not isinstance(name, str) or not any(
-                name in known for known in (self._obstacles, self._attached, links)
-            ):
-                raise UnknownNameError("body", name, (*self._obstacles, *self._attached, *sorted(links)))
-        if first == second:
-            raise SceneError(f"the body {first!r} is not checked against itself, expected two bodies")
-        pair = {frozenset((first, second))}
-        self._set_allowed(self.meshes.allowed | pair if allowed else self.meshes.allowed - pair)
+        changed = set[frozenset[str]]()
+        for pair in pairs:
+            for name in pair:
+                if not isinstance(name, str) or not any(
+                    name in known for known in (self._obstacles, self._attached, links)
+                ):
+                    raise UnknownNameError("body", name, (*self._obstacles, *self._attached, *sorted(links)))
+            if len(set(pair)) == 1:
+                raise SceneError(f"the body {pair[0]!r} is not checked against itself, expected two bodies")
+            changed.add(frozenset(pair))
+        self._set_allowed(self.meshes.allowed | changed if allowed else self.meshes.allowed - changed)
 
     def _forget_allowed(self, name: str) -> None:
         """Remove the pairs of a body that is gone."""

@@ -87,6 +87,14 @@ class WorkspaceGoal(Protocol):
 
 
 @runtime_checkable
+class Hinting(Protocol):
+    """A goal that may tell what is meant where it is out of reach."""
+
+    def hint(self) -> str:
+        """Return as what it may be meant, or nothing."""
+
+
+@runtime_checkable
 class GoalSet(Protocol):
     """Goals of which any will do, which sample themselves."""
 
@@ -112,6 +120,7 @@ class GoalSamples:
         converged: Number of attempts that reached the goal, free or in collision.
         best: Error terms of the best attempt.
         blocked: A collision of the last state that reached the goal; empty if one was free or none reached it.
+        hint: As what a goal that was not reached may be meant, or nothing.
     """
 
     states: Array
@@ -119,6 +128,7 @@ class GoalSamples:
     converged: int
     best: Mapping[str, float]
     blocked: str
+    hint: str = ""
 
     @property
     def fault(self) -> str:
@@ -132,7 +142,8 @@ class GoalSamples:
         if self.converged:
             return f"all {self.converged} states found at the goal in {self.attempts} attempts collide, {self.blocked}"
         best = ", ".join(f"{name} {value:.3g} {unit_of(name)} off" for name, value in self.best.items())
-        return f"not reached in {self.attempts} attempts; the best has {best}"
+        hint = f"; {self.hint}" if self.hint else ""
+        return f"not reached in {self.attempts} attempts; the best has {best}{hint}"
 
 
 def sample(
@@ -170,7 +181,8 @@ def sample(
         converged = 0
     if search.colliding is not None and not len(states):
         blocked = str(next(iter(checker.contacts(search.colliding)), "in collision"))
-    return GoalSamples(states, search.attempts, converged, search.errors, blocked)
+    hint = goal.hint() if isinstance(goal, Hinting) and not len(states) and not converged else ""
+    return GoalSamples(states, search.attempts, converged, search.errors, blocked, hint)
 
 
 def sample_on_constraints(

@@ -10,7 +10,7 @@ import pinocchio as pin
 from apex_ompl.constraints.frames import Frame, frame_of
 from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.errors import ParameterError
-from apex_ompl.goals.alignment import angle
+from apex_ompl.goals.alignment import angle, within
 from apex_ompl.kernel import Target, offset_target, opposition_target
 from apex_ompl.kernel.products import product
 from apex_ompl.robot import Robot
@@ -22,6 +22,9 @@ from apex_ompl.util.forking import ProcessLock
 POSITION_WEIGHT = 4.0  # weight of a position error against an angle in inverse kinematics [rad/m]
 DRAWN = 24  # poses that stand for a region
 TURNING = 6  # joints with which an arm reaches turns that are drawn
+MEANT = "positions are meters and quaternions [x, y, z, w]"
+HINTS = 32  # descents by which another reading of poses is tried
+FAR = 10.0  # coordinate from which millimeters are likely [m]
 RESIDUAL = 1e-6  # largest residual at which inverse kinematics ends
 
 
@@ -46,7 +49,7 @@ class PoseGoal:
             UnknownNameError: A frame is not a hand, a link or a held object.
             ParameterError: The free turn of a contact face is not about its z axis.
         """
-        self.robot = robot
+        self.robot, self._attached = robot, tuple(attached)
         self.poses = tuple(poses)
         self.start = np.clip(start, robot.limits.lower, robot.limits.upper)  # as plans clip it
         held = {a.name: a for a in attached}
@@ -110,6 +113,29 @@ class PoseGoal:
                 targets.append(opposition_target(axis, in_world(wanted[:, k]), -1.0))
         return targets
 
+    def hint(self) -> str:
+        """Return as what poses that are out of reach may be meant, if they can be reached as that; else nothing."""
+        far = max(abs(value) for pose in self.poses for value in pose.position) >= FAR
+        turned = any(pose.orientation is not None for pose in self.poses)
+        for millimeters, first in ((True, False), (False, True), (True, True)):
+            if (far or not millimeters) and (turned or not first):
+                poses = [_read(pose, millimeters, first) for pose in self.poses]
+                if PoseGoal(self.robot, poses, self._attached, self.start)._is_reached():
+                    said = ["in millimeters"] if millimeters else []
+                    said += ["as a quaternion [w, x, y, z]"] if first else []
+                    return f"{' and '.join(said)} it could be reached, but here {MEANT}"
+        return ""
+
+    def _is_reached(self) -> bool:
+        """Whether one of a few descents reaches the poses."""
+        limits, free = self.robot.limits, self.inverse.free
+        states = np.tile(self.start, (HINTS, 1))
+        rng, shape = np.random.default_rng(0), (HINTS - 1, len(free))
+        states[1:, free] = rng.uniform(limits.lower[free], limits.upper[free], shape)
+        ends = self.inverse.descend(states, tolerance=RESIDUAL)
+        best = ends.states[np.argsort(ends.errors)[:1]]
+        return any(within(self.errors(q), self.bounds) for q in best)
+
     def nearest(self, q: Array) -> Array:
         """Return the result of inverse kinematics from a state, shape (dof,); it need not reach the poses."""
         found: Array = self.inverse.descend(np.asarray(q, float), tolerance=RESIDUAL).states[0]
@@ -164,6 +190,16 @@ def _drawn(pose: PoseTarget, placed: Array, rng: np.random.Generator | None, tur
         by = by if rng is None else float(rng.uniform(*pose.turn))
         turned = product(wanted[:3, :3], pin.exp3(by * np.eye(3)[k]))
         update |= {"orientation": tuple(pin.Quaternion(turned).coeffs().tolist()), "free_turn": None, "turn": None}
+    return pose.model_copy(update=update)
+
+
+def _read(pose: PoseTarget, millimeters: bool, first: bool) -> PoseTarget:
+    """Return a pose whose position was given in millimeters, or whose quaternion was given with w first."""
+    update: dict[str, object] = {}
+    if millimeters:
+        update["position"] = tuple(1e-3 * value for value in pose.position)
+    if first and pose.orientation is not None:
+        update["orientation"] = (*pose.orientation[1:], pose.orientation[0])
     return pose.model_copy(update=update)
 
 

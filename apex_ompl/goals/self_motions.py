@@ -74,7 +74,8 @@ def search(
         most: Number of states after which no further curve is searched for.
     """
     free = inverse.free
-    states, curves, missed = list[Array](), list[int](), list[Array]()
+    shape = (-1, len(base))
+    states, curves, missed = np.empty((0, len(base))), list[int](), list[Array]()
     attempts = idle = number = 0
     while attempts < descents and idle < IDLE and len(states) < most:
         seeds = np.tile(base, (min(BATCH, descents - attempts), 1))
@@ -86,20 +87,17 @@ def search(
             if not error <= REACHED:
                 missed.append(q)
                 continue
-            redundant = _redundancy(inverse, q)
-            near = SPACING if redundant else SAME
-            if states and (np.abs(np.array(states) - q).max(axis=1) <= near).any():
+            away = float(np.abs(states - q).max(axis=1).min(initial=np.inf))
+            redundant = _redundancy(inverse, q) if away > SAME else 0
+            if away <= (SPACING if redundant else SAME):
                 idle += 1
                 continue
             idle = 0
             found = list(_curve(inverse, limits, q)) if redundant == 1 else [q]
-            states += found
+            states = np.concatenate([states, found])
             curves += [number] * len(found)
             number += 1
-    shape = (-1, len(base))
-    return SelfMotions(
-        np.array(states).reshape(shape), np.array(curves, np.intp), attempts, np.array(missed).reshape(shape)
-    )
+    return SelfMotions(states, np.array(curves, np.intp), attempts, np.array(missed).reshape(shape))
 
 
 def _redundancy(inverse: IKSolver, q: Array) -> int:

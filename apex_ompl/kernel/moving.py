@@ -33,6 +33,7 @@ Packed = tuple[Any, ...]
 """Packed dynamic obstacles."""
 
 SAMPLE_WIDTH = motion_optimization.WIDTH  # control points of a spline in time that a sample depends on
+MOST_SPANS = compiled_intervals.MOST_SPANS  # blocked intervals of a place
 
 
 class LimitArrays(NamedTuple):
@@ -131,7 +132,7 @@ def blocked_intervals(
     Returns:
         The intervals of each piece in order, shape (P, most, 2) [s], and their numbers, shape (P,).
     """
-    spans = np.zeros((len(places), compiled_intervals.MOST_SPANS, 2))
+    spans = np.zeros((len(places), MOST_SPANS, 2))
     counts, (start, end) = np.empty(len(places), np.int64), window
     compiled_intervals.blocked_intervals(
         *kernel.robot.packed, *dynamic, *kernel.workspace(), curve.knots, curve.states, curve.rates,
@@ -401,6 +402,8 @@ class MotionCost(NamedTuple):
         limits: Limits of velocity, acceleration and jerk times the knot spacing, its square and cube, shape (3, dof).
         limit_weight: Weight of half the square of what they are exceeded by, as a share.
         settings: Margins, stiffness and steps.
+        given: Values at the samples of joints that follow a given motion, NaN of all others, shape (N, dof); without
+            such joints (0, dof).
     """
 
     grid: PathGrid
@@ -408,6 +411,7 @@ class MotionCost(NamedTuple):
     limits: Array
     limit_weight: float
     settings: CostSettings
+    given: Array
 
 
 def optimize_motion(
@@ -429,8 +433,8 @@ def optimize_motion(
     slope = np.empty(slopes)
     report = motion_optimization.optimize_motion(
         *kernel.packed, *dynamic, *kernel.workspace(), _places(dynamic), *cost.grid, cost.times, cost.limits,
-        float(cost.limit_weight), pinned, control, tuple(cost.settings), *optimization_buffers(pinned, *control.shape),
-        slope,
+        float(cost.limit_weight), compact(cost.given), pinned, control, tuple(cost.settings),
+        *optimization_buffers(pinned, *control.shape), slope,
     )  # fmt: skip
     return PathReport(*report), slope
 

@@ -108,16 +108,25 @@ class MotionOptimizer:
     """
 
     def __init__(
-        self, kernel: Kernel, dynamic: DynamicObstacles, limits: Limits, settings: MotionSettings | None = None
-    ) -> None:
+        self, kernel: Kernel, dynamic: DynamicObstacles, limits: Limits, settings: MotionSettings | None = None,
+        given: Callable[[Array], Array] | None = None,
+    ) -> None:  # fmt: skip
         """Optimize motions of the kernel's robot within limits of velocity, acceleration and jerk.
+
+        Args:
+            kernel: The robot among static obstacles; joints that stay, or are given, have limits there that are equal.
+            dynamic: The dynamic obstacles.
+            limits: Limits of all joints.
+            settings: Settings of the cost.
+            given: Values of joints that follow a given motion at times of the clock, shape (N,) [s], NaN of the other
+                joints, shape (N, dof); None where there are no such joints.
 
         Raises:
             ParameterError: The limits are those of other joints.
         """
         check_array(limits.velocity, (kernel.robot.dof,), "limits")
         self.kernel, self.dynamic, self.limits = kernel, dynamic, limits
-        self.settings = settings or MotionSettings()
+        self.settings, self.given = settings or MotionSettings(), given
         self.samples = 0
 
     def improve(
@@ -195,7 +204,8 @@ class MotionOptimizer:
         times = clock + (np.arange(len(grid.weights)) + 0.5) / len(grid.weights) * spline.duration
         powers = np.power(spline.spacing, [[1.0], [2.0], [3.0]])
         most = s.limit_share * powers * np.stack([limits.velocity, limits.acceleration, limits.jerk])
-        cost = MotionCost(grid, times, most, s.limit_weight, self._cost_settings(steps, enough, damping))
+        given = np.empty((0, dof)) if self.given is None else self.given(times)
+        cost = MotionCost(grid, times, most, s.limit_weight, self._cost_settings(steps, enough, damping), given)
         report, slope = optimize_motion(self.kernel, self.dynamic.packed, cost, PINNED, control, slopes)
         self.samples += (report.steps + 1) * len(times)
         return spline._replace(control=control), report, slope

@@ -7,7 +7,7 @@ LaValle 2006, section 7.1.3), among safe intervals of time (Phillips and Likhach
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +88,7 @@ class Profile(NamedTuple):
 
 
 class Query(NamedTuple):
-    """Arguments of :func:`retime`."""
+    """Arguments of :func:`retime`: times of the motion and of the clock at the start, hold, horizon and deviation."""
 
     time: float
     clock: float
@@ -145,14 +145,32 @@ def retime(
     for name, value in (("time", time), ("clock", clock), ("hold", hold), ("horizon", horizon)):
         check_number(value, name)
     query = Query(min(max(float(time), 0.0), motion.duration), float(clock), float(hold), float(horizon), deviation)
-    return _Search(kernel, dynamic, motion, limits, query).result()
+
+    def find(places: Array, start: float, end: float) -> Blocked:
+        return blocked(kernel, dynamic, motion, places, start=start, end=end, slack=deviation)
+
+    return retime_around(find, motion, limits, query)
+
+
+def retime_around(
+    find: Callable[[Array, float, float], Blocked], motion: Trajectory, limits: Limits, query: Query
+) -> Retimed:
+    """Return the motion along the remaining path that arrives first where places are blocked at known times.
+
+    Args:
+        find: Returns when places along the motion, shape (P, 2) [s], are blocked between two times.
+        motion: A motion within the limits that ends at rest.
+        limits: Limits of the joints.
+        query: See :func:`retime`.
+    """
+    return _Search(find, motion, limits, query).result()
 
 
 class _Search:
     """Search of the speed along the remaining part of one motion."""
 
     def __init__(
-        self, kernel: Kernel, dynamic: DynamicObstacles, motion: Trajectory, limits: Limits, query: Query
+        self, find: Callable[[Array, float, float], Blocked], motion: Trajectory, limits: Limits, query: Query
     ) -> None:
         """Find the blocked intervals."""
         self.motion, self.limits = motion, LimitArrays.of(limits)
@@ -165,11 +183,7 @@ class _Search:
         edges = self.points[:-1, None] + self.length / PIECES * np.arange(PIECES)
         edges = np.append(edges.ravel(), self.points[-1])
         where = np.stack([edges[:-1], edges[1:]], axis=1), np.stack([self.points, self.points], axis=1)
-        self.pieces, self.stops = (
-            blocked(
-                kernel, dynamic, motion, p, start=self.clock, end=self.latest + self.hold, slack=self.deviation
-            ) for p in where
-        )  # fmt: skip
+        self.pieces, self.stops = (find(places, self.clock, self.latest + self.hold) for places in where)
         self.states = np.stack([motion.positions, motion.velocities, motion.accelerations])
         self.rates = motion.states(edges)[1:]
         self.rests = not np.any(self.rates[:, 0])

@@ -52,34 +52,66 @@ PERTURBATIONS = 4  # of the straight line to each goal
 
 
 @dataclass(frozen=True)
-class Among:
-    """Context of a plan among dynamic obstacles.
+class InTime:
+    """Context of a plan in time.
 
     Attributes:
         query: The query, among the static obstacles.
-        prover: Proves motions.
         timing: How motions are timed.
         limits: The limits by it.
-        stages: Those of ``STAGES`` that are tried.
     """
 
     query: PlanQuery
-    prover: TimedProver
     timing: Timing
     limits: Limits
-    stages: Sequence[str] = STAGES
 
     def stop(self) -> bool:
         """Whether time is up."""
         return self.query.ends()
 
     @property
-    def kernel(self) -> Kernel:
-        """The kernel among the static obstacles, in which joints that are not planned stay."""
-        setup, arrays = self.query.setup, self.query.setup.checker.kernel.robot.arrays
+    def start(self) -> Start:
+        """Position, velocity and acceleration at the start of the motion."""
+        q = self.query.setup.start
+        derivatives = self.timing.start(self.limits)
+        return Start.at_rest(q) if derivatives is None else Start(q, *derivatives)
+
+    def kernel_of(self, checker: CollisionChecker) -> Kernel:
+        """Return the kernel of a checker, in which joints that are not planned stay."""
+        setup, arrays = self.query.setup, checker.kernel.robot.arrays
         lower, upper = arrays.lower.copy(), arrays.upper.copy()
         lower[setup.held] = upper[setup.held] = setup.start[setup.held]
-        return setup.checker.kernel.within(lower, upper)
+        return checker.kernel.within(lower, upper)
+
+    def optimizer(self) -> MotionOptimizer:
+        """Return the optimizer of motions."""
+        raise NotImplementedError
+
+    def accepts(self, motion: Trajectory) -> bool:
+        """Whether a motion has a proof."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Among(InTime):
+    """Context of a plan among dynamic obstacles.
+
+    Attributes:
+        prover: Proves motions.
+        stages: Those of ``STAGES`` that are tried.
+    """
+
+    prover: TimedProver
+    stages: Sequence[str] = STAGES
+
+    @property
+    def kernel(self) -> Kernel:
+        """The kernel among the static obstacles, in which joints that are not planned stay."""
+        return self.kernel_of(self.query.setup.checker)
+
+    def optimizer(self) -> MotionOptimizer:
+        """Return the optimizer of motions among the obstacles."""
+        return MotionOptimizer(self.kernel, self.prover.dynamic, self.limits)
 
     def fields(self, motion: Trajectory) -> dict[str, Any] | None:
         """Return what a result says of the proof of a motion, or None.
@@ -131,7 +163,7 @@ def plan_among_dynamic_obstacles(
     robot = setup.robot
     if setup.constraints is not None:
         stages = [stage for stage in stages if stage != SPACE_TIME]  # which knows no constraints
-    among = Among(query, prover, timing, timing.limits(robot.limits, robot.joint_names), stages)
+    among = Among(query, timing, timing.limits(robot.limits, robot.joint_names), prover, stages)
     still = time(prove(solve(query), simplify), timing)
     if not still or still.trajectory is None:
         return still
@@ -187,40 +219,37 @@ def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
 
 
 def _by_space_time(among: Among, still: PlanResult, turn: int, best: PlanResult | None) -> PlanResult | None:
+    """Return the result with a motion that is optimized in space and time and ends before the best one, or None."""
+    motion, known = still.trajectory, None if best is None else best.trajectory
+    assert motion is not None
+    found = space_time_motion(among, motion, turn, math.inf if known is None else known.duration)
+    return None if found is None else _result(among, still, found, SPACE_TIME)
+
+
+def space_time_motion(context: InTime, motion: Trajectory, turn: int, shorter: float = math.inf) -> Trajectory | None:
     """Return the motion that is optimized in space and time and ends first, or None.
 
     Args:
-        among: The context.
-        still: The path among the static obstacles, with its motion.
+        context: The context.
+        motion: That along the path among the static obstacles.
         turn: Number of times that it was called before; perturbations become larger.
-        best: A result; motions that end no earlier are skipped.
+        shorter: Motions that take no less are skipped [s].
     """
-    motion = still.trajectory
-    assert motion is not None
-    optimizer = MotionOptimizer(among.kernel, among.prover.dynamic, among.limits)
-    found = None if best is None else best.trajectory
-    given = found
+    optimizer, found = context.optimizer(), None
     for factor in FACTORS:
-        for initial in _initial_motions(among.query, among.limits, motion, turn):
+        for initial in _initial_motions(context.query, context.limits, motion, turn):
             duration = factor * 2.0 ** min(turn, LONGER) * initial.duration
-            if among.stop():
+            if context.stop():
                 break
-            if found is not None and duration >= found.duration:
+            if duration >= shorter:
                 continue
-            spline = TimedSpline.along(initial.states, duration, _start(among), initial.goal)
-            better = optimizer.repair(spline, among.accepts, stop=among.stop)
-            if better is not None and (found is None or better.duration < found.duration):
-                found = better
-        if found is not given:
+            spline = TimedSpline.along(initial.states, duration, context.start, initial.goal)
+            better = optimizer.repair(spline, context.accepts, stop=context.stop)
+            if better is not None and better.duration < shorter:
+                found, shorter = better, better.duration
+        if found is not None:
             break
-    return None if found is None or found is given else _result(among, still, found, SPACE_TIME)
-
-
-def _start(among: Among) -> Start:
-    """Return position, velocity and acceleration at the start of the motion."""
-    q = among.query.setup.start
-    derivatives = among.timing.start(among.limits)
-    return Start.at_rest(q) if derivatives is None else Start(q, *derivatives)
+    return found
 
 
 _warm: set[str] = set()  # robots of which the code is loaded

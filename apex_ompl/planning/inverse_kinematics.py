@@ -132,14 +132,15 @@ def solve(
     parts = [_Part(robot, group, held, base, fixed) for group in _groups(robot, poses, held, base, fixed)]
     for part in parts:
         if far := part.out_of_reach():
-            return IKResult((), far, 0, 0)
+            return IKResult((), _hinted(far, part), 0, 0)
     rng = np.random.default_rng(seed)
     found = [part.search(rng, descents) for part in parts]
     tried = sum(one.descents for one in found)
     for part, motions in zip(parts, found, strict=True):
         if not len(motions.states):
             causes = part.limits_in_the_way(motions.missed)
-            return IKResult((), _reason(f"none found for {part.names}", tried, causes), tried, 0, causes)
+            reason = _reason(f"none found for {part.names}", tried, causes)
+            return IKResult((), _hinted(reason, part), tried, 0, causes)
     states, branches = _combined(found, parts, base)
     free = checker.are_free(states)
     if not free.any():
@@ -171,6 +172,12 @@ def blame(checker: CollisionChecker, states: Array) -> dict[str, float]:
 def _reason(what: str, descents: int, causes: Mapping[str, float]) -> str:
     shares = ", ".join(f"{cause} ({100.0 * share:.0f} %)" for cause, share in causes.items())
     return f"{what} in {counted(descents, 'descent')}" + (f"; in the way: {shares}" if shares else "")
+
+
+def _hinted(reason: str, part: _Part) -> str:
+    """Return a reason with a hint, where the poses could be reached in another unit or order."""
+    hint = part.goal.hint()
+    return f"{reason}; {hint}" if hint else reason
 
 
 def _groups(

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from apex_ompl.collision import CollisionChecker
     from apex_ompl.constraints.user import UserConstraint
+    from apex_ompl.ompl.setup import PlanningSetup
     from apex_ompl.paths.path import Path
     from apex_ompl.planners import AnyPlanner
     from apex_ompl.planning.checks import ProofResult, StateCheck
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from apex_ompl.planning.line_query import Waypoint
     from apex_ompl.planning.lines import LineResult
     from apex_ompl.planning.query import Group, State, Target
+    from apex_ompl.planning.step_records import PlanQuery
     from apex_ompl.planning.task_result import TaskResult
     from apex_ompl.planning.tasks import TaskSearch
     from apex_ompl.result import PlanResult
@@ -118,9 +120,14 @@ class MotionPlanner:
 
     def plan(
         self, start: State, goal: Target, planner: AnyPlanner | None = None, *,
-        group: Group | None = None, name: str = "world", **options: Unpack[PlanKeywords],
+        group: Group | None = None, name: str = "world", while_executing: Trajectory | None = None,
+        offset: float = 0.0, **options: Unpack[PlanKeywords],
     ) -> PlanResult:  # fmt: skip
         """Plan in the world as it is now.
+
+        With ``while_executing`` other joints, of another arm, execute a known motion meanwhile. The trajectory of the
+        result is then the motion of all joints, until both have ended; ``trajectory.selected(joints)`` is that of the
+        group.
 
         Args:
             start: The start.
@@ -129,6 +136,9 @@ class MotionPlanner:
             group: Joints that are planned, by names of groups and joints; the others stay as at the start, and a goal
                 by joint names may leave them out. All by default.
             name: Name of the problem in the result.
+            while_executing: Motion of some of the other joints, or of all joints, of which those count that move. The
+                start has the values that they have at ``offset``, or leaves them out; goals do not change them.
+            offset: Time of that motion at which the plan starts [s]; where it is negative the motion starts later.
             **options: As of :func:`apex_ompl.plan`: ``timeout``, ``seed``, ``simplify``, ``params``, ``snapshot``,
                 ``timing``, ``objective``, ``calm_factor``, ``leave_contact``, ``constraints``.
 
@@ -139,9 +149,14 @@ class MotionPlanner:
         started = time.perf_counter()
         check_options(options, OPTIONS)
         with running(), self._lock:
-            problem = self.problem(start, goal, name, group, options.get("seed", 0))
+            given = PlanOptions(group=group, **options)
+            if while_executing is not None:
+                return self._plan_while(
+                    start, goal, planner, started, given, name=name, motion=while_executing, offset=offset
+                )
+            problem = self.problem(start, goal, name, group, given.seed)
             _check_is_no_line(problem)
-            return self._plan(problem, planner, started, PlanOptions(group=group, **options))
+            return self._plan(problem, planner, started, given)
 
     def plan_problem(
         self, problem: Problem, planner: AnyPlanner | None = None, **options: Unpack[ProblemKeywords]
@@ -309,6 +324,53 @@ class MotionPlanner:
             if departure is not None:
                 result = steps.finish(query, with_departure(result, given, departure, timing))
             return result
+
+    def _plan_while(
+        self, start: State, goal: Target, planner: AnyPlanner | None, started: float, options: PlanOptions, *,
+        name: str, motion: Trajectory, offset: float,
+    ) -> PlanResult:  # fmt: skip
+        """Plan while other joints execute a motion, while the lock is held; see :meth:`plan`."""
+        with unforked():
+            from apex_ompl.apex.parameters import NAME
+            from apex_ompl.collision.conservative import CheckCounts
+            from apex_ompl.ompl.process import Interrupt, quiet_ompl, seed_ompl
+            from apex_ompl.planning import among_dynamic_obstacles, motions, steps, while_executing
+            from apex_ompl.timing import Timing
+
+        options.check()
+        if not options.timing or options.leave_contact:
+            wanted = "True or a Timing, and no contact to leave, with while_executing"
+            raise ParameterError("timing", options.timing, wanted)
+        timing = Timing() if options.timing is True else options.timing
+        parameters = planners.chosen(
+            NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
+        )
+        asked = while_executing.Asked.of(self.robot, start, options.group, motion, offset)
+        problem = self.problem(asked.at_end, goal, name, asked.planned, options.seed)
+        problem = problem.model_copy(update={"goal": asked.goal_at_end(problem.goal)})
+        _check_is_no_line(problem)
+        self._check_nothing_moves()
+        with quiet_ompl(), Interrupt() as interrupt, running(interrupt.end):
+            with unforked():
+                checker = self._checker_without(self._absent())
+                checker.check_counts = CheckCounts()
+                motions.warm_up(checker)
+                among_dynamic_obstacles.warm_up(checker)
+                seed_ompl(options.seed)
+
+            def query_of(setup: PlanningSetup) -> PlanQuery:
+                query = steps.check(
+                    setup, parameters, timeout=options.timeout, objective=options.objective,
+                    calm_factor=options.calm_factor, started=started, notes=setup.notes,
+                    times={"setup": time.perf_counter() - started},
+                )  # fmt: skip
+                query.interrupt = interrupt
+                return query
+
+            return while_executing.plan_while_executing(
+                query_of, problem, checker, asked, simplify=options.simplify, timing=timing, seed=options.seed,
+                constraints=options.constraints,
+            )  # fmt: skip
 
     def plan_line(
         self, start: State, pose: Waypoint | Sequence[Waypoint], *, frame: str | None = None,

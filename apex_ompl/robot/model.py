@@ -259,7 +259,9 @@ class Robot:
         k = int(np.argmax(bad))
         by = max(low[k] - q[k], q[k] - high[k])
         amount = f"{by:.2g} " if by < LIMIT_SLACK else ""  # which may not show in the rounded value
-        return f"{self.joint_names[k]} = {q[k]:.6g} is {amount}outside its limits [{low[k]:.6g}, {high[k]:.6g}]"
+        degrees = abs(q[k]) > 2.0 * np.pi and low[k] <= np.radians(q[k]) <= high[k]
+        hint = "; in degrees it would be inside, and angles are radians" if degrees else ""
+        return f"{self.joint_names[k]} = {q[k]:.6g} is {amount}outside its limits [{low[k]:.6g}, {high[k]:.6g}]{hint}"
 
     def within_limits(self, states: Array) -> Array:
         """Return states, shape (..., dof), with joints that are a little outside their limits moved to them.

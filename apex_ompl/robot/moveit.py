@@ -22,16 +22,19 @@ import numpy as np
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.robot.moveit_messages import ADD, REMOVE, MessageReader, RobotMessageReader
-from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
+from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields, pose_matrix
 from apex_ompl.scene.constraints import Constraint, FixedOrientation, ToolRegion, Upright
+from apex_ompl.scene.grids import OCTOMAP_HEAD
 from apex_ompl.scene.problem import Goal, PoseTarget, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.schema import read_yaml, validate
+from apex_ompl.util.validation import is_integer
 
 MATRIX = "allowed_collision_matrix"
 SIDES = ("above", "below")  # of a joint's tolerances
 TURN = 3.14  # tolerance of an angle from which turns about an axis are free [rad]
 EXACT_ANGLE = 0.01  # tolerance up to which an orientation counts as fixed [rad]
+ALONG = 1e-3  # largest element of a rotation that counts as 0
 SAME_POINT = 1e-4  # largest distance between points that count as the same [m]
 HARMLESS = ("workspace_parameters", "planner_id", "num_planning_attempts", "allowed_planning_time", "pipeline_id")
 
@@ -218,9 +221,7 @@ def converted(
 
 def _obstacles(reader: RobotMessageReader, data: Mapping[str, Any], start: Array) -> list[Obstacle]:
     world = reader.section(data, "world") if "world" in data else data
-    octomap = reader.section(reader.section(world, "octomap", "world"), "octomap", "world.octomap")
-    if octomap.get("data"):
-        raise reader.fail("world.octomap", "an octomap", "cannot be read, expected primitives and meshes")
+    octree = _octree(reader, reader.section(world, "octomap", "world"), start)
     found: dict[str, list[Obstacle]] = {}  # by the object's name; operations are carried out one after the other
     for k, item in enumerate(reader.messages(world, "collision_objects")):
         where = f"collision_objects.{k}"
@@ -235,7 +236,29 @@ def _obstacles(reader: RobotMessageReader, data: Mapping[str, Any], start: Array
             reader.record(Obstacle, {"name": name, **shape, **pose_fields(base @ pose)}, where)
             for name, shape, pose in _bodies(reader, item, where)
         ]
-    return [body for bodies in found.values() for body in bodies]
+    return [body for bodies in found.values() for body in bodies] + octree
+
+
+def _octree(reader: RobotMessageReader, message: Mapping[str, Any], start: Array) -> list[Obstacle]:
+    """Return the obstacle of an ``octomap_msgs/OctomapWithPose``, or none where it is empty."""
+    where = "world.octomap.octomap"
+    octomap = reader.section(message, "octomap", "world.octomap")
+    given = octomap.get("data")
+    if not given:
+        return []
+    if not reader.flag(octomap.get("binary", False), f"{where}.binary") or octomap.get("id") != "OcTree":
+        raise reader.fail(where, octomap.get("id"), "cannot be read, expected a binary map of the kind OcTree")
+    if not isinstance(given, bytes):
+        values = reader.entries(octomap, "data", where)
+        if not all(is_integer(value) and -128 <= value < 256 for value in values):
+            raise reader.fail(f"{where}.data", "a list", "expected bytes, as whole numbers")
+        given = bytes(value % 256 for value in values)
+    side = reader.number(octomap.get("resolution"), f"{where}.resolution")
+    head = f"{OCTOMAP_HEAD.decode()}\nid OcTree\nsize 0\nres {side!r}\ndata\n"
+    base = reader.frame(str(reader.section(message, "header", "world.octomap").get("frame_id", "")), start, where)
+    pose = base @ reader.pose(message.get("origin"), "world.octomap.origin")
+    voxels = {"file": "octomap.bt", "content": head.encode() + given}
+    return [reader.record(Obstacle, {"name": "octomap", "voxels": voxels, **pose_fields(pose)}, where)]
 
 
 def _attached(
@@ -344,14 +367,14 @@ def _position_constraint(
     reader: RobotMessageReader, message: Mapping[str, Any], start: Array, where: str
 ) -> ToolRegion:
     """Return the box that a link's origin, or the grasp point of a hand, stays in."""
-    frame, shape, pose = _region(reader, message, start, where, "box")
+    frame, shape, pose = _region(reader, message, start, where, ("box",))
     half = np.array(shape["box"]) / 2.0
     fields = {"lower": tuple((-half).tolist()), "upper": tuple(half.tolist()), **pose_fields(pose)}
     return reader.record(ToolRegion, {"frame": frame, **fields}, f"{where}.constraint_region")
 
 
 def _region(
-    reader: RobotMessageReader, message: Mapping[str, Any], start: Array, where: str, kind: str
+    reader: RobotMessageReader, message: Mapping[str, Any], start: Array, where: str, kinds: Sequence[str]
 ) -> tuple[str, dict[str, Any], Array]:
     """Return the frame of a position constraint, a link or a hand, the one shape that it is in, and that one's pose."""
     link, base = reader.constrained_link(message, start, where)
@@ -363,64 +386,101 @@ def _region(
             expected = "cannot be read, expected 0, or the grasp point of a hand"
             raise reader.fail(f"{where}.target_point_offset", offset.tolist(), expected)
         link = near[0]
-    inside_of, expected = f"{where}.constraint_region", f"cannot be read, expected one {kind}"
+    inside_of, expected = f"{where}.constraint_region", f"cannot be read, expected one {' or '.join(kinds)}"
     region = reader.section(message, "constraint_region", where)
     reader.refuse(region, "meshes", "a list", expected, inside_of)
     shapes = reader.paired(region, "primitives", "primitive_poses", inside_of)
     if len(shapes) != 1:
         raise reader.fail(f"{inside_of}.primitives", len(shapes), expected)
     shape = reader.primitive(shapes[0][0], f"{inside_of}.primitives.0")
-    if kind not in shape:
+    if not shape.keys() & set(kinds):
         raise reader.fail(f"{inside_of}.primitives.0", next(iter(shape)), expected)
     return link, shape, base @ shapes[0][1]
 
 
 def _goal(reader: RobotMessageReader, data: Mapping[str, Any], start: Mapping[str, float]) -> Goal:
-    """Return the goal: poses of one or more links, as MoveIt makes them of poses, or joints."""
+    """Return the goal: poses of one or more links, joints, or several of both of which any will do."""
     goals = reader.messages(data, "goal_constraints")
-    if len(goals) == 1 and goals[0].get("position_constraints") and not goals[0].get("joint_constraints"):
-        return Goal(poses=tuple(_pose_targets(reader, goals[0], start, "goal_constraints.0")))
-    return Goal(joints=tuple(_joint_goals(reader, goals, start)))
+    posed = [bool(goal.get("position_constraints")) and not goal.get("joint_constraints") for goal in goals]
+    if not any(posed):
+        return Goal(joints=tuple(_joint_goals(reader, dict(enumerate(goals)), start)))
+    found = list[Goal]()
+    for k, (goal, of_poses) in enumerate(zip(goals, posed, strict=True)):
+        if of_poses:
+            found.append(Goal(poses=tuple(_pose_targets(reader, goal, start, f"goal_constraints.{k}"))))
+        else:
+            found.append(Goal(joints=tuple(_joint_goals(reader, {k: goal}, start))))
+    return found[0] if len(found) == 1 else Goal(any_of=tuple(found))
 
 
 def _pose_targets(
     reader: RobotMessageReader, goal: Mapping[str, Any], start: Mapping[str, float], where: str
 ) -> Iterator[PoseTarget]:
-    """Yield a pose for each position constraint, which is a ball; its center and its radius, as a tolerance, count.
+    """Yield a pose for each position constraint: a ball, whose radius is the tolerance, or a box along the axes.
 
-    An orientation constraint of the same link gives the orientation, with the smallest of its tolerances.
+    An orientation constraint of the same link gives the orientation: with the smallest of its tolerances, free about an
+    axis whose tolerance is pi, and any where all three are.
     """
     reader.refuse(goal, "visibility_constraints", "a list", "cannot be read, expected none", where)
     q = np.array([start[name] for name in reader.robot.joint_names])
     turns = {str(one.get("link_name")): one for one in reader.messages(goal, "orientation_constraints", where)}
     for k, message in enumerate(reader.messages(goal, "position_constraints", where)):
-        at = f"{where}.position_constraints.{k}"
-        frame, shape, pose = _region(reader, message, q, at, "sphere")
-        tolerance = {"position": shape["sphere"]["radius"]}
+        at, link = f"{where}.position_constraints.{k}", str(message.get("link_name"))
+        frame, shape, pose = _region(reader, message, q, at, ("sphere", "box"))
+        turn, tolerance = turns.pop(link, None), dict[str, float]()
         fields: dict[str, Any] = {"frame": frame, "position": pose_fields(pose)["position"], "tolerance": tolerance}
-        turn = turns.pop(str(message.get("link_name")), None)
         if turn is not None:
-            there = f"{where}.orientation_constraints of {message.get('link_name')}"
-            _, base = reader.constrained_link(turn, q, there)
-            fields["orientation"] = pose_fields(base @ reader.pose({"orientation": turn.get("orientation")}, there))[
-                "orientation"
-            ]
-            angles = [reader.number(turn.get(f"absolute_{axis}_axis_tolerance", 0.0), there) for axis in "xyz"]
-            tolerance["angle"] = min(angles)
+            fields |= _wanted_orientation(reader, turn, q, f"{where}.orientation_constraints of {link}", tolerance)
+        if "sphere" in shape:
+            tolerance["position"] = shape["sphere"]["radius"]
+        else:
+            fields |= _box_of_positions(reader, shape["box"], pose, fields.get("orientation"), at)
         yield reader.record(PoseTarget, fields, at)
     if turns:
         raise reader.fail(where, next(iter(turns)), "expected a position for each link with an orientation")
 
 
+def _wanted_orientation(
+    reader: RobotMessageReader, message: Mapping[str, Any], start: Array, where: str, tolerance: dict[str, float]
+) -> dict[str, Any]:
+    """Return the orientation of a pose and its free turn, where there are any, and add the tolerance of its angle."""
+    _, base = reader.constrained_link(message, start, where)
+    base = base @ reader.pose({"orientation": message.get("orientation")}, where)
+    angles = [reader.number(message.get(f"absolute_{axis}_axis_tolerance", 0.0), where) for axis in "xyz"]
+    free = [axis for axis, angle in zip("xyz", angles, strict=True) if angle >= TURN]
+    if len(free) == 3:
+        return {}
+    if len(free) == 2:
+        raise reader.fail(where, angles, "cannot be read, expected at most one tolerance from pi, or three")
+    tolerance["angle"] = min(angles)
+    turned = {"free_turn": free[0]} if free else {}
+    return {"orientation": pose_fields(base)["orientation"], **turned}
+
+
+def _box_of_positions(
+    reader: RobotMessageReader, size: Sequence[float], pose: Array, orientation: Sequence[float] | None, where: str
+) -> dict[str, Any]:
+    """Return the least and largest positions in a box, along the axes of the wanted orientation, or of the world."""
+    wanted = pose_matrix((0.0, 0.0, 0.0), orientation or (0.0, 0.0, 0.0, 1.0))[:3, :3]
+    turn = np.abs(wanted.T @ pose[:3, :3])
+    if np.abs(turn - turn.round()).max() > ALONG:
+        expected = (
+            "cannot be read, expected a box along the axes of the wanted orientation, or of the world without one"
+        )
+        raise reader.fail(f"{where}.constraint_region.primitive_poses.0", pose[:3, :3].round(4).tolist(), expected)
+    half = turn.round() @ np.array(size) / 2.0
+    return {"lower": tuple((-half).tolist()), "upper": tuple(half.tolist())}
+
+
 def _joint_goals(
-    reader: RobotMessageReader, found: Sequence[Mapping[str, Any]], start: Mapping[str, float]
+    reader: RobotMessageReader, found: Mapping[int, Mapping[str, Any]], start: Mapping[str, float]
 ) -> list[dict[str, float]]:
     goals = []
-    for k, goal in enumerate(found):
+    for k, goal in found.items():
         where = f"goal_constraints.{k}"
         for other in ("position_constraints", "orientation_constraints", "visibility_constraints"):
             if goal.get(other):
-                expected = "cannot be read, expected joint_constraints only, or one goal of positions"
+                expected = "cannot be read, expected joint_constraints only, or position_constraints without these"
                 raise reader.fail(f"{where}.{other}", "a list", expected)
         values = dict(start)
         reached = False

@@ -22,6 +22,7 @@ from apex_ompl.util.validation import is_integer, is_number
 
 PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
 ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
+OPERATIONS = {"add": ADD, "remove": REMOVE}
 WORLD_FRAMES = ("", "world", "map")
 RecordT = TypeVar("RecordT", bound=StrictModel)
 
@@ -182,8 +183,8 @@ class RobotMessageReader(MessageReader):
 
     def primitive(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
         """Return the fields of a shape_msgs/SolidPrimitive."""
-        kind = data.get("type")
-        kind = PRIMITIVES.get(kind, kind) if isinstance(kind, int) else str(kind).lower()
+        kind = self.constant(data.get("type"))
+        kind = PRIMITIVES.get(kind, kind) if is_integer(kind) else str(kind).strip().lower()
         size = self.entries(data, "dimensions", where)
         counts = {"box": 3, "sphere": 1, "cylinder": 2}
         if kind not in counts:
@@ -229,11 +230,23 @@ class RobotMessageReader(MessageReader):
 
     def operation(self, item: Mapping[str, Any], known: tuple[int, ...], where: str) -> int:
         """Return what is done with an object, out of the known operations."""
-        found = item.get("operation", ADD)
+        given = item.get("operation", ADD)
+        found = self.constant(given)
+        found = OPERATIONS.get(found.strip().lower(), found) if isinstance(found, str) else found
         if not is_integer(found) or found not in known:
-            also = f", or {REMOVE} to remove it" if REMOVE in known else ""
-            raise self.fail(f"{where}.operation", found, f"expected {ADD} to add an object{also}")
+            also = f", or {REMOVE} or remove to remove it" if REMOVE in known else ""
+            raise self.fail(f"{where}.operation", given, f"expected {ADD} or add to add an object{also}")
         return int(found)
+
+    def constant(self, value: Any) -> Any:
+        """Return a constant as a number where it is one, or a text of digits, or the byte that tools of ROS print."""
+        if isinstance(value, bytes) and len(value) == 1:
+            return value[0]
+        if isinstance(value, str):
+            if value.strip().isdecimal():
+                return int(value)
+            return ord(value) if len(value) == 1 and not value.isprintable() else value
+        return value
 
     def mesh(self, data: Mapping[str, Any], where: str) -> dict[str, Any]:
         """Return the fields of a mesh that is named by its path."""

@@ -25,6 +25,7 @@ POINT_SUFFIXES = (".npy", ".ply", ".pcd")
 GRID_SUFFIXES = (".npz",)
 VOXEL_SUFFIXES = (".npz", ".bt")
 LARGEST = 1e4  # longer lengths and larger masses are errors [m, kg]
+LONG = 50.0  # length from which a body is noted [m]
 INERTIA_TOLERANCE = 1e-3  # relative error of moments of inertia, which files round
 
 
@@ -86,11 +87,26 @@ def _base64(text: str | None) -> str | None:
 class FileShape(StrictModel):
     """A shape from a file.
 
+    In Python the file may be a ``Path``, the content bytes, and a name or path alone stands for a shape of it.
+
     Attributes:
         content: Content of the file in base64, from memory: the file is not read then, and its name tells the format.
     """
 
     content: Annotated[str | None, AfterValidator(_base64), Field(repr=False)] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_python(cls, data: Any) -> Any:
+        fields = {"file": data} if isinstance(data, (str, os.PathLike)) else data
+        if not isinstance(fields, Mapping):
+            return fields
+        found = dict(fields)
+        if isinstance(found.get("file"), os.PathLike):
+            found["file"] = os.fspath(found["file"])
+        if isinstance(found.get("content"), (bytes, bytearray)):
+            found["content"] = base64.b64encode(found["content"]).decode("ascii")
+        return found
 
 
 class MeshFile(FileShape):
@@ -344,6 +360,15 @@ def given_fields(body: Body, left_out: Collection[str] = ()) -> dict[str, Any]:
     """Return the fields of a body that have a value, by name; what they hold is not copied."""
     fields = ((name, getattr(body, name)) for name in type(body).model_fields if name not in left_out)
     return {name: value for name, value in fields if value is not None}
+
+
+def size_note(body: Body) -> str:
+    """Return a sentence on a body that is so long that another unit is likely; else nothing."""
+    bar = body.cylinder or body.capsule
+    lengths = body.box or ((2.0 * body.sphere.radius,) if body.sphere is not None else ())
+    lengths = (2.0 * bar.radius, bar.length) if bar is not None else lengths
+    longest = max(lengths, default=0.0)
+    return f"{body.name} is {longest:g} m long; lengths are meters" if longest >= LONG else ""
 
 
 def file_shape(body: Body) -> MeshFile | PointFile | GridFile | None:

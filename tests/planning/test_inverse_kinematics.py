@@ -164,6 +164,21 @@ def test_out_of_reach_is_said_where_the_links_are_too_short(panda: Robot) -> Non
                 assert "out of reach" not in planner.ik(one, descents=1, count=1).reason
 
 
+def test_poses_in_millimeters_or_with_w_first_get_a_hint(panda: Robot) -> None:
+    up = PoseTarget(frame="hand", position=(0.2, 0.0, 1.0), orientation=(0.0, 0.0, 0.0, 1.0))
+    with MotionPlanner(panda) as planner:
+        assert planner.ik(up, descents=64)
+        for given, words in (
+            ({"position": (200.0, 0.0, 1000.0)}, "; in millimeters it could be reached, but here positions are meters"),
+            ({"orientation": (1.0, 0.0, 0.0, 0.0)}, "; as a quaternion [w, x, y, z] it could be reached"),
+        ):
+            wrong = up.model_copy(update=given)
+            assert words in planner.ik(wrong, descents=64).reason
+            assert words in planner.plan("home", wrong, timeout=1.0).reason
+        high = PoseTarget(frame="hand", position=(0.0, 0.0, 3.0))
+        assert "could be reached" not in planner.ik(high).reason
+
+
 def test_forward_kinematics_are_pinocchios_also_of_held_objects(panda: Robot) -> None:
     q = panda.random_state(np.random.default_rng(1))
     with MotionPlanner(panda) as planner:

@@ -167,3 +167,23 @@ def test_an_edit_waits_until_a_plan_has_ended() -> None:
             assert started.wait(10.0) and not done.wait(0.2) and not planner.world.obstacles
         assert done.wait(10.0) and tuple(planner.world.obstacles) == ("late",)
         thread.join()
+
+
+def test_files_are_paths_or_content_from_memory_and_long_bodies_are_noted(robot: Robot, tmp_path: Path) -> None:
+    file = tmp_path / "cube.obj"
+    file.write_text(CUBE_OBJ)
+    with MotionPlanner(robot) as planner:
+        far = (1.5, 0.0, 1.5)
+        planner.world.add(name="path", mesh={"file": file}, position=far)
+        planner.world.add(name="text", mesh=str(file), position=far)
+        planner.world.add(name="bytes", mesh={"file": "cube.obj", "content": file.read_bytes()}, position=far)
+        free = CollisionChecker(robot, planner.world.obstacles.values())
+        distances = [
+            CollisionChecker(robot, [one]).obstacle_distance(robot.home[None]) for one in free.obstacles.values()
+        ]
+        assert distances[0] == distances[1] == distances[2] > 0.0
+        planner.world.add(name="floor", box=(100.0, 100.0, 0.1), position=(0.0, 0.0, -0.5))
+        result = planner.plan("home", {**dict(zip(robot.joint_names, robot.home, strict=True)), "left_joint1": 0.1})
+        assert "floor is 100 m long; lengths are meters" in result.notes
+    with pytest.raises(FileFormatError, match="mesh file ending in"):
+        planner.world.add(name="odd", mesh=tmp_path / "cube.txt")

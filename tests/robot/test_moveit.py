@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.config import DATA
 from apex_ompl.robot.moveit import Conversion, convert
 from apex_ompl.scene.constraints import FixedOrientation, ToolRegion, Upright
+from apex_ompl.scene.grids import parse_octomap
 
 JOINTS = {f"panda_joint{k}": f"left_joint{k}" for k in range(1, 8)}
 FRAMES = {"base_link": "world", "palm": "left_hand_palm"}
@@ -167,12 +169,37 @@ def test_a_goal_of_positions_and_orientations_is_one_of_poses(robot: Robot, tmp_
     (free,) = converted(tmp_path, robot, request=head + alone).problem.goal.poses or ()
     assert free.orientation is None
     for change, word in (
-        (("type: 2, dimensions: [0.002]", "type: 1, dimensions: [1, 1, 1]"), "expected one sphere"),
+        (("type: 2, dimensions: [0.002]", "type: 3, dimensions: [1, 1]"), "expected one sphere or box"),
+        (("type: 2, dimensions: [0.002]", "type: 1, dimensions: [1, 1, 1]"), None),
         (("link_name: palm\n        orientation", "link_name: left_link5\n        orientation"), "a position for each"),
         (("link_name: palm", "link_name: nose"), "expected a link of"),
     ):
+        changed = head + POSE_GOAL.replace(*change)
+        if word is None:
+            (box,) = converted(tmp_path, robot, request=changed).problem.goal.poses or ()
+            assert (box.lower, box.upper) == ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+            continue
         with pytest.raises(FileFormatError, match=word):
-            converted(tmp_path, robot, request=head + POSE_GOAL.replace(*change))
+            converted(tmp_path, robot, request=changed)
+
+
+def test_boxes_free_turns_and_several_goals_become_goals_of_which_any_will_do(robot: Robot, tmp_path: Path) -> None:
+    head = REQUEST.split("goal_constraints")[0]
+    quarter = "orientation: {x: 0.0, y: 0.0, z: 0.7071068, w: 0.7071068}"
+    boxed = (
+        POSE_GOAL.replace("type: 2, dimensions: [0.002]", "type: BOX, dimensions: [0.2, 0.1, 0.04]")
+        .replace("orientation: {w: 1.0}", quarter)
+        .replace("z_axis_tolerance: 0.04", "z_axis_tolerance: 3.2")
+    )
+    pose = (converted(tmp_path, robot, request=head + boxed).problem.goal.poses or ())[0]
+    np.testing.assert_allclose(pose.upper, (0.05, 0.1, 0.02), atol=1e-12)
+    assert pose.free_turn == "z" and pose.tolerance.angle == 0.03
+    with pytest.raises(FileFormatError, match="along the axes of the wanted orientation"):
+        converted(tmp_path, robot, request=head + boxed.replace(quarter, "orientation: {z: 0.38, w: 0.92}"))
+    joints = REQUEST.partition("goal_constraints:\n")[2]
+    both = converted(tmp_path, robot, request=head + POSE_GOAL + joints).problem.goal
+    assert both.any_of is not None and len(both.any_of) == 2
+    assert both.any_of[0].poses is not None and both.any_of[1].joints is not None
 
 
 def test_the_command_converts_and_what_it_writes_plans(apex_cli, robot: Robot, tmp_path: Path) -> None:
@@ -206,10 +233,32 @@ def test_operations_are_carried_out_one_after_the_other(robot: Robot, tmp_path: 
     assert [b.name for b in done.problem.scene] == ["pillar"], "REMOVE without a name removes all"
 
 
-@pytest.mark.parametrize("value", ["'1'", "true", "2"])
-def test_operations_are_whole_numbers(robot: Robot, tmp_path: Path, value: str) -> None:
-    with pytest.raises(FileFormatError, match=r"collision_objects\.3\.operation: expected 0 to add .* or 1 to remove"):
+@pytest.mark.parametrize("value", ["1.5", "true", "2", "clear"])
+def test_operations_are_constants_of_the_message(robot: Robot, tmp_path: Path, value: str) -> None:
+    with pytest.raises(FileFormatError, match=r"collision_objects\.3\.operation: expected 0 or add .* or 1 or remove"):
         converted(tmp_path, robot, SCENE + f"    - {{id: base, operation: {value}}}\n")
+
+
+@pytest.mark.parametrize("value", ["remove", "REMOVE", "'1'", '"\\x01"', "!!binary AQ=="])
+def test_constants_are_numbers_or_words(robot: Robot, tmp_path: Path, value: str) -> None:
+    scene = SCENE.replace("id: pillar", "operation: add\n      id: pillar").replace("type: 3", "type: '3'")
+    done = converted(tmp_path, robot, scene + f"    - {{id: base, operation: {value}}}\n")
+    assert [body.name for body in done.problem.scene] == ["pillar", "rock"]
+    assert done.problem.scene[0].cylinder is not None
+
+
+def test_an_octree_of_a_message_is_read_from_memory(robot: Robot, tmp_path: Path) -> None:
+    data = [3, 0] * 15 + [2, 0]  # the first child of each node, down to one cell that is occupied
+    tree = f"{{binary: true, id: OcTree, resolution: 0.1, data: {data}}}"
+    octomap = f"  octomap: {{origin: {{position: {{x: 0.5}}}}, octomap: {tree}}}\n"
+    made = converted(tmp_path, robot, SCENE + octomap).problem.scene[-1]
+    assert made.name == "octomap" and made.voxels is not None and made.voxels.content is not None
+    occupied, side, corner = parse_octomap(base64.b64decode(made.voxels.content), 10)
+    assert occupied.shape == (1, 1, 1) and side == 0.1
+    np.testing.assert_allclose(corner, [-3276.8] * 3)
+    assert made.position == (0.5, 0.0, 0.0)
+    with pytest.raises(FileFormatError, match="expected a binary map"):
+        converted(tmp_path, robot, SCENE + octomap.replace("binary: true", "binary: false"))
 
 
 def test_what_ros_prints_may_end_in_an_empty_document(robot: Robot, tmp_path: Path) -> None:

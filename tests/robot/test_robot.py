@@ -167,6 +167,8 @@ def test_limit_fault_names_joint_value_and_limit(robot: Robot) -> None:
     assert robot.limit_fault(q) == "left_joint4 = 0.5 is outside its limits [-3.0718, -0.0698]"
     q[3] = robot.limits.upper[3] + 1e-9
     assert robot.limit_fault(q) == "left_joint4 = -0.0698 is 1e-09 outside its limits [-3.0718, -0.0698]"
+    q[3] = -90.0
+    assert (robot.limit_fault(q) or "").endswith("; in degrees it would be inside, and angles are radians")
     q[3] = np.nan
     assert "left_joint4" in (robot.limit_fault(q) or "")
     assert "(16,)" in (robot.limit_fault(q[:5]) or "")

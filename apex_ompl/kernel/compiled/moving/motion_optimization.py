@@ -7,6 +7,9 @@ whose k-th differences are D_k P,
     limits = weight / 2 sum_k sum_i sum_d max(0, |D_k P|_id / (limit_kd h^k) - 1)^2,   k = 1, 2, 3,
 
 counts velocities, accelerations and jerks: those of a cubic spline are convex combinations of these numbers.
+
+Joints may follow a given motion, as those of another arm do: at the samples they have its values, and their control points
+stay.
 """
 
 from __future__ import annotations
@@ -52,6 +55,8 @@ class MotionProblem(NamedTuple):
         times: Times of the samples by the dynamic obstacles' clock, shape (N,) [s].
         limits: Limits of velocity, acceleration and jerk times the knot spacing, its square and its cube, (3, dof).
         limit_weight: Weight of what they are exceeded by.
+        given: Values at the samples of joints that follow a given motion, NaN of all others, shape (N, dof); without
+            such joints (0, dof).
     """
 
     weights: Floats
@@ -62,6 +67,27 @@ class MotionProblem(NamedTuple):
     times: Floats
     limits: Floats
     limit_weight: float
+    given: Floats
+
+
+@inlined
+def _set_given(given: Floats, k: int, q: Floats) -> None:
+    """Put the values that joints are given at sample ``k`` into a state."""
+    if k < len(given):
+        for i in range(len(q)):
+            if not math.isnan(given[k, i]):
+                q[i] = given[k, i]
+
+
+@inlined
+def _clear_given(given: Floats, k: int, gradient: Floats, gram: Floats) -> None:
+    """Put zeros into the gradient and the rows and columns of the matrix of joints that are given."""
+    if k < len(given):
+        for i in range(len(gradient)):
+            if not math.isnan(given[k, i]):
+                gradient[i] = 0.0
+                for j in range(len(gradient)):
+                    gram[i, j], gram[j, i] = 0.0, 0.0
 
 
 @inlined
@@ -119,6 +145,7 @@ def evaluate_motion(
     total, share, q = 0.0, 1.0 / len(weights), b.state
     for k in range(len(weights)):
         set_sample(weights, first, k, control, t.lower, t.upper, q)
+        _set_given(problem.given, k, q)
         if not tables_hold(t, q, w.half_width):
             return PathCost(math.inf, math.inf, -math.inf, -math.inf)
         cost, scene, own = state_cost(
@@ -130,6 +157,7 @@ def evaluate_motion(
         cost += moving
         if cost > 0.0:
             total += share * cost
+            _clear_given(problem.given, k, b.state_gradient, b.state_gram)
             add_sample(
                 share, weights[k], first[k], pinned, free, b.state_gradient, b.state_gram, gradient, gram, b.room
             )
@@ -143,7 +171,7 @@ def optimize_motion(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, mi: Integers, mf: Floats, ms: Singles,
     wi: Integers, wf: Floats, offset: Floats,
     weights: Floats, first: Integers, speed_gram: Floats, times: Floats, limits: Floats, limit_weight: float,
-    pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats, slope: Floats,
+    given: Floats, pinned: int, control: Floats, numbers: Numbers, bi: Integers, bf: Floats, slope: Floats,
 ) -> Report:  # fmt: skip
     """Improve a motion in place; its free control points (P, dof) are put inside the limits.
 
@@ -159,7 +187,7 @@ def optimize_motion(
     points, dof = control.shape
     b = buffers_view(bi, bf, ((points - 2 * pinned) * dof, points, dof))
     problem = MotionProblem(
-        weights, first, speed_gram, m, scene_of_dynamic(m, offset), times, limits, limit_weight
+        weights, first, speed_gram, m, scene_of_dynamic(m, offset), times, limits, limit_weight, given
     )  # fmt: skip
     c, taken, damping = descend(
         evaluate_motion, problem, t, s, w, speed_gram, pinned, control, CostSettings(*numbers), b, WIDTH

@@ -1,0 +1,219 @@
+"""Plans beside a given motion and schedules of two arms, against the meshes alone at dense samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from apex_ompl import MotionPlanner, PoseTarget, Trajectory
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ApexError
+from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
+from apex_ompl.moving.given_motion import GivenMotion, rest, together, until_rest
+from apex_ompl.moving.motion_optimizer import MotionOptimizer
+from apex_ompl.planning.schedule import ArmStep, replaced, schedule
+from apex_ompl.planning.while_executing import Asked, WhileExecuting, moved_links
+from apex_ompl.result import PlanStatus
+from apex_ompl.robot import Robot
+from apex_ompl.timing.timed_spline import Start, TimedSpline
+from apex_ompl.timing.trajectory import joined
+
+MIDDLE = (0.5, 0.0, 0.45)  # reached by both hands, not by both at once [m]
+
+
+@pytest.fixture(scope="module")
+def planner() -> Iterator[MotionPlanner]:
+    with MotionPlanner() as found:
+        yield found
+
+
+def arm(robot: Robot, q: np.ndarray, side: str) -> dict[str, float]:
+    return {name: float(v) for name, v in zip(robot.joint_names, q, strict=True) if name.startswith(f"{side}_joint")}
+
+
+@pytest.fixture(scope="module")
+def reached(planner: MotionPlanner) -> dict[str, dict[str, float]]:
+    """Joint values of each arm with its hand in the middle, by side."""
+    found = {}
+    for side in ("left", "right"):
+        pose = PoseTarget(frame=f"{side}_hand", position=MIDDLE)
+        found[side] = arm(planner.robot, planner.ik(pose, near="home", count=1, descents=32)[0].state, side)
+    return found
+
+
+@pytest.fixture(scope="module")
+def there_and_back(planner: MotionPlanner, reached: dict[str, dict[str, float]]) -> Trajectory:
+    """The right arm goes to the middle and back."""
+    there = planner.plan("home", reached["right"], group="right_arm").trajectory
+    assert there is not None
+    back = planner.plan(there.positions[-1], "home", group="right_arm").trajectory
+    assert back is not None
+    return joined([there, back])
+
+
+def collisions(robot: Robot, motion: Trajectory, spacing: float = 0.02) -> int:
+    times = np.append(np.arange(0.0, motion.duration, spacing), motion.duration)
+    return int((~CollisionChecker(robot, proofs=False).are_free(motion(times))).sum())
+
+
+@pytest.mark.parametrize("offset", [-0.3, 0.0, 0.2])
+def test_a_given_motion_is_the_same_motion_beside_another(
+    robot: Robot, there_and_back: Trajectory, offset: float
+) -> None:
+    given = GivenMotion.of(robot, there_and_back, offset)
+    assert given.joint_names == tuple(name for name in robot.joint_names if name.startswith("right_joint"))
+    left = [k for k in range(robot.dof) if k not in given.columns]
+    own = rest(robot.home, 0.0, robot.joint_names)
+    both = given.combined(own)
+    times = np.linspace(0.0, both.duration, 40)
+    np.testing.assert_allclose(
+        both(times)[:, given.columns], there_and_back(times + offset)[:, given.columns], atol=1e-12
+    )
+    assert (both(times)[:, left] == robot.home[left]).all() and both.duration == there_and_back.duration - offset
+    assert np.array_equal(np.isnan(given.values(times)[0]), np.isin(np.arange(robot.dof), left))
+    half = both.selected(given.joint_names)
+    again = together([half, own.selected([robot.joint_names[k] for k in left])])
+    assert until_rest(joined([again, rest(again.positions[-1], 1.0, again.joint_names)])).duration <= both.duration
+    assert moved_links(robot, tuple(given.columns)) == {
+        link for link in robot.link_names if link.startswith("right_") and not link.endswith("link0")
+    }
+
+
+def test_gradients_beside_a_given_motion_agree_with_differences(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]]
+) -> None:
+    robot, given = planner.robot, GivenMotion.of(planner.robot, there_and_back)
+    goal = np.array([reached["left"].get(name, home) for name, home in zip(robot.joint_names, robot.home, strict=True)])
+    line = np.linspace(robot.home, goal, 20)
+
+    def values(times: np.ndarray) -> np.ndarray:  # there in half the time, and no way back
+        return given.values(np.minimum(2.0 * times, 0.5 * there_and_back.duration))
+
+    spline = TimedSpline.along(line, 0.6 * there_and_back.duration, Start.at_rest(robot.home), goal)
+    optimizer = MotionOptimizer(planner.checker.kernel, DynamicObstacles(()), robot.limits, given=values)
+    report, slope = optimizer.evaluate(spline)
+    alone = MotionOptimizer(planner.checker.kernel, DynamicObstacles(()), robot.limits).evaluate(spline)[0]
+    assert report.clearance_cost > alone.clearance_cost and report.own_clearance < 0.0 < alone.own_clearance
+    step, rng = 1e-6, np.random.default_rng(0)
+    for row, joint in zip(rng.integers(len(slope), size=12), rng.integers(7, size=12), strict=True):
+        costs = []
+        for sign in (1.0, -1.0):
+            control = spline.control.copy()
+            control[row + 3, joint] += sign * step
+            costs.append(optimizer.evaluate(spline._replace(control=control))[0].cost)
+        assert slope[row, joint] == pytest.approx((costs[0] - costs[1]) / (2.0 * step), rel=1e-3, abs=1e-5)
+    control = spline.control.copy()
+    control[5, given.columns] += 0.3  # which the given values replace at the samples
+    assert optimizer.evaluate(spline._replace(control=control))[0].clearance_cost == report.clearance_cost
+
+
+def test_an_arm_plans_while_the_other_moves(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]]
+) -> None:
+    robot, goal = planner.robot, reached["left"]
+    alone = planner.plan("home", goal, group="left_arm")
+    assert alone.trajectory is not None
+    asked = Asked.of(robot, "home", "left_arm", there_and_back, 0.0)
+    assert collisions(robot, asked.given.combined(alone.trajectory)) > 0
+    result = planner.plan("home", goal, group="left_arm", while_executing=there_and_back)
+    assert result and result.trajectory is not None and result.solved_by.endswith(("retiming", "space-time"))
+    assert collisions(robot, result.trajectory) == 0 and planner.prove(result.trajectory)
+    times = np.linspace(0.0, result.trajectory.duration, 50)
+    right = result.trajectory.selected(asked.given.joint_names)
+    np.testing.assert_allclose(right(times), there_and_back(times)[:, asked.given.columns], atol=1e-12)
+    end = dict(zip(robot.joint_names, result.trajectory.positions[-1].tolist(), strict=True))
+    assert all(end[name] == value for name, value in goal.items())
+    own = until_rest(result.trajectory.selected(asked.planned))
+    assert own.duration < there_and_back.duration + alone.trajectory.duration
+    later = {name: v for name, v in zip(robot.joint_names, robot.home, strict=True) if "right_joint" not in name}
+    ended = planner.plan(later, goal, group="left_arm", while_executing=there_and_back, offset=there_and_back.duration)
+    assert ended and ended.trajectory is not None
+    assert ended.trajectory.duration == pytest.approx(alone.trajectory.duration)
+
+
+def test_motions_are_optimized_in_space_and_time_beside_another(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]], monkeypatch
+) -> None:
+    monkeypatch.setattr(
+        WhileExecuting, "retimed", lambda self, motion: type("No", (), {"trajectory": None, "deviation": 0.0})()
+    )
+    result = planner.plan("home", reached["left"], group="left_arm", while_executing=there_and_back, timeout=20.0)
+    assert result and result.solved_by.endswith("space-time") and result.trajectory is not None
+    assert collisions(planner.robot, result.trajectory) == 0
+    assert max(result.limit_use.values()) <= 1.0 + 1e-6
+
+
+def test_faulty_motions_are_refused_in_one_sentence(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]]
+) -> None:
+    robot, goal = planner.robot, reached["left"]
+    other = rest(np.zeros(1), 1.0, ["elbow"])
+    cases = (
+        ({"while_executing": other}, "unknown joint of dual_panda_softhand in while_executing 'elbow'"),
+        ({"while_executing": [1, 2]}, "while_executing.*expected a Trajectory"),
+        ({"while_executing": there_and_back, "group": "right_arm"}, "group.*joints that while_executing does not move"),
+        ({"while_executing": there_and_back, "group": "legs"}, "unknown group or joint 'legs'"),
+        ({"while_executing": there_and_back, "offset": 0.4}, r"start\.right_joint1.*as while_executing has at 0.4 s"),
+        ({"while_executing": there_and_back.before(0.2)}, "not at rest at its end"),
+        ({"while_executing": there_and_back.after(0.2), "offset": -1.0}, "offset.*not at rest at its start"),
+        ({"while_executing": there_and_back, "timing": False}, "timing.*True or a Timing"),
+    )
+    for options, words in cases:
+        with pytest.raises(ApexError, match=words):
+            planner.plan("home", goal, **{"group": "left_arm", **options})
+    inside = dict(zip(robot.joint_names, robot.home.tolist(), strict=True)) | goal
+    middle = float(there_and_back.duration / 2.0)
+    inside = {name: value for name, value in inside.items() if "right_joint" not in name}
+    result = planner.plan(inside, "home", group="left_arm", while_executing=there_and_back, offset=middle)
+    assert result.status is PlanStatus.INVALID_START and "at 0 s: " in result.reason and "right_" in result.reason
+
+
+def test_schedules_keep_their_order_and_are_no_slower_than_synchronous_ones(
+    planner: MotionPlanner, reached: dict[str, dict[str, float]]
+) -> None:
+    robot = planner.robot
+    home = {side: arm(robot, robot.home, side) for side in reached}
+    aside = {side: {**home[side], f"{side}_joint1": home[side][f"{side}_joint1"] + 0.4} for side in reached}
+    steps = [
+        ArmStep("put", "left_arm", reached["left"], hold=0.2),
+        ArmStep("away", "left_arm", aside["left"]),
+        ArmStep("look", "right_arm", aside["right"]),
+        ArmStep("take", "right_arm", reached["right"], after=("put",)),
+        ArmStep("home", "right_arm", home["right"]),
+    ]
+    found = {mode: schedule(planner, "home", steps, mode=mode, most_plans=8, timeout=60.0) for mode in
+             ("asynchronous", "synchronous", "sequential")}  # fmt: skip
+    for one in found.values():
+        assert one and one.trajectory is not None and collisions(robot, one.trajectory, 0.04) == 0
+        times = {step.name: step for step in one.steps}
+        assert times["take"].start >= times["put"].end and times["away"].start >= times["put"].end
+        assert one.makespan == pytest.approx(one.trajectory.duration)
+    ends = [one.makespan for one in found.values()]
+    assert ends[0] <= ends[1] + 1e-9 and ends[1] < ends[2]
+    known = found["asynchronous"]
+    new = replaced(planner, known, "right_arm", [ArmStep("other", "right_arm", aside["right"])], after="take")
+    assert new and new.trajectory is not None and collisions(robot, new.trajectory, 0.04) == 0
+    assert [step.name for step in new.steps if step.group == "right_arm"] == ["look", "take", "other"]
+    assert np.array_equal(new.motions["left_arm"].positions, known.motions["left_arm"].positions)
+
+
+def test_faulty_steps_are_refused(planner: MotionPlanner, reached: dict[str, dict[str, float]]) -> None:
+    left, right = (ArmStep(side, f"{side}_arm", reached[side]) for side in ("left", "right"))
+    cases = (
+        ([], "one ArmStep or more"),
+        ([left, left], "names that differ"),
+        (
+            [left, ArmStep("right", "right_arm", reached["right"], after=("l",))],
+            "unknown step in steps.right.after 'l'",
+        ),
+        ([ArmStep("a", "left_arm", "home", after=("b",)), ArmStep("b", "right_arm", "home", after=("a",))], "circle"),
+        ([left, ArmStep("c", "left_joint1", "home")], "groups that do not share left_joint1"),
+        ([left, ArmStep("c", "legs", "home")], "unknown group or joint 'legs'"),
+    )
+    for steps, words in cases:
+        with pytest.raises(ApexError, match=words):
+            schedule(planner, "home", steps)
+    stuck = schedule(planner, "home", [left, right], most_plans=4)
+    assert not stuck and "no order of the steps was found" in stuck.reason and "right_" in stuck.reason
