@@ -19,7 +19,6 @@ from apex_ompl.util.display import counted
 LEAST = 4  # joints of an arm
 FINGER = re.compile(r"finger|gripper|thumb|index|middle|ring_|little|pinky|hand_|jaw|knuckle|grip", re.I)
 LEG = re.compile(r"(?<![a-z])legs?(?![a-z])|hip_|_hip|knee|ankle|foot|thigh|calf|wheel|caster|steer|_leg|leg_", re.I)
-TURN = round(2.0 * math.pi, 6)  # range of a continuous joint to either side [rad]
 RANGE = {"revolute": 3.141593, "prismatic": 0.5}  # assumed to either side where the URDF has none [rad, m]
 SPEED = {"revolute": 2.0, "continuous": 2.0, "prismatic": 0.1}  # assumed where the URDF has none [rad/s, m/s]
 FASTEST = 50.0  # speeds beyond are placeholders [rad/s]
@@ -190,8 +189,7 @@ def joint_record(joint: UrdfJoint) -> tuple[dict[str, float], list[str]]:
     record: dict[str, float] = {}
     notes = []
     if joint.kind == "continuous":
-        record |= {"lower": -TURN, "upper": TURN}
-        notes.append("continuous, planned from -2 pi to 2 pi")
+        notes.append("turns without end; give lower and upper if cables or hoses do not allow that")
     elif math.isnan(joint.lower):
         record |= {"lower": -RANGE[joint.kind], "upper": RANGE[joint.kind]}
         notes.append("no range in the URDF, assumed")
@@ -199,7 +197,7 @@ def joint_record(joint: UrdfJoint) -> tuple[dict[str, float], list[str]]:
     if math.isnan(velocity) or velocity > FASTEST:
         velocity = record["velocity"] = SPEED[joint.kind]
         notes.append("no velocity in the URDF, assumed")
-    if {"lower", "upper"} <= record.keys():
+    if joint.kind == "continuous" or {"lower", "upper"} <= record.keys():
         record["velocity"] = velocity
     record |= {"acceleration": float(f"{RAMP * velocity:.4g}"), "jerk": float(f"{JERK * velocity:.4g}")}
     return record, notes
