@@ -88,9 +88,9 @@ class TreePair:
     """RRT-Connect on what a kernel proves, from some starts to some goals; it goes on where it stopped.
 
     A share NEAR of the random states is normally distributed around straight lines from starts to goals; the others are
-    uniform in the limits, of continuous joints half a turn beyond starts and goals. Distances are Euclidean, with joints
-    weighed. Where there are guides, states of paths that are nearly free, as of a model's proposals, a
-    share GUIDED of all is normally distributed around these instead (after Ichter, Harrison and Pavone 2018).
+    uniform in the limits, of continuous joints half a turn beyond starts and goals. Where there are guides, states of
+    paths that are nearly free, as of a model's proposals, a share GUIDED of all is normally distributed around these
+    instead (after Ichter, Harrison and Pavone 2018). Distances are Euclidean, with joints weighed.
     States that the kernel cannot prove free count as blocked (:mod:`apex_ompl.kernel.compiled.path.search`).
     """
 

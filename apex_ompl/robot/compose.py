@@ -353,7 +353,7 @@ def _mount(root: ET.Element, part: Part, child: str) -> list[str]:
     if planar is None:
         return []
     axes = (("x", "1 0 0", planar.x), ("y", "0 1 0", planar.y), ("yaw", "0 0 1", (-WIDEST, WIDEST)))
-    for (axis, along, (low, high)), first, second in zip(axes, ends[1:], ends[2:], strict=True):
+    for (axis, along, (low, high)), first, second in zip(axes, ends[1:-1], ends[2:], strict=True):
         joint = _joint_between(root, f"{name}_{axis}", "revolute" if axis == "yaw" else "prismatic", first, second)
         ET.SubElement(joint, "axis", xyz=along)
         ET.SubElement(joint, "limit", lower=f"{low:.17g}", upper=f"{high:.17g}", velocity="1", effort="0")

@@ -423,7 +423,8 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     return Robot(
         name=config.name, joint_names=names, limits=limits, effort=effort, home=home, poses=poses, groups=groups,
         hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures, weights=weights,
-        continuous=continuous, part_links=composition.part_links, urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
+        continuous=continuous, part_links=composition.part_links, urdf=composition.urdf, covers=covers,
+        files=tuple(files), _order=order,
     )  # fmt: skip
 
 

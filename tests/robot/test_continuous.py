@@ -126,7 +126,7 @@ def test_a_pose_is_reached_by_the_nearest_turn(robot: Robot) -> None:
 
 def test_joints_that_mimic_an_endless_one_turn_with_it_or_are_refused(tmp_path: Path) -> None:
     pointer = '<link name="pointer"/>' + JOINT.format(
-        name="follow", axis="0 0 1", at=0.1, above="base", below="pointer"
+        name="upon", axis="0 0 1", at=0.1, above="base", below="pointer"
     ).replace('type="revolute"', 'type="continuous"')
     for multiplier, fault in (("-2", ""), ("0.5", "mimics 'turn', which turns without end")):
         mimic = f'<mimic joint="turn" multiplier="{multiplier}"/></joint>'
