@@ -133,18 +133,8 @@ def assemble(
     """
     robot = robot or load_robot(problem.robot)
     names = robot.joint_names
-    asked = problem.start_state(names)
-    start = robot.within_limits(asked)
-    given_goals = problem.goal_states(names)
-    goals = robot.within_limits(given_goals)
-    notes = _moved_notes(robot, asked, start, "start")
-    for k, (given_goal, goal) in enumerate(zip(given_goals, goals, strict=True)):
-        notes += _moved_notes(robot, given_goal, goal, "goal" if len(goals) == 1 else f"goal {k}")
     held = np.array([k for k, name in enumerate(names) if moving is not None and name not in moving], np.intp)
-    goals = robot.turned_to(goals, start)
-    stays = given_goals[:, held] == asked[held]
-    stays |= robot.continuous[held] & np.isclose(goals[:, held], start[held], 0.0, SAME_ANGLE)
-    goals[:, held] = np.where(stays, start[held], goals[:, held])  # where it is moved to
+    start, goals, notes = _ends(problem, robot, held)
     lower, upper = bounds = _bounds(robot, start, held)
     limits = replace(robot.limits, lower=lower, upper=upper)
     sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)
@@ -233,6 +223,23 @@ def constraint_set(
     hands = (hand.synergy for hand in robot.hands.values() if hand.synergy is not None)
     fixed = sorted({*held.tolist(), *(robot.joint_names.index(name) for name in hands)})
     return ConstraintSet.of(robot, (*problem.constraints, *constraints), problem.attached, start, fixed)
+
+
+def _ends(problem: Problem, robot: Robot, held: NDArray[np.intp]) -> tuple[Array, Array, list[str]]:
+    """Return the start, shape (dof,), the goals nearest to it, shape (N, dof), and notes on joints that were moved.
+
+    Joints a little outside their limits are moved to them, goals of continuous joints by whole turns.
+    """
+    asked, given_goals = problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)
+    start, goals = robot.within_limits(asked), robot.within_limits(given_goals)
+    notes = _moved_notes(robot, asked, start, "start")
+    for k, (given_goal, goal) in enumerate(zip(given_goals, goals, strict=True)):
+        notes += _moved_notes(robot, given_goal, goal, "goal" if len(goals) == 1 else f"goal {k}")
+    goals = robot.turned_to(goals, start)
+    stays = given_goals[:, held] == asked[held]
+    stays |= robot.continuous[held] & np.isclose(goals[:, held], start[held], 0.0, SAME_ANGLE)
+    goals[:, held] = np.where(stays, start[held], goals[:, held])  # where it is moved to
+    return start, goals, notes
 
 
 def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[str]:

@@ -19,6 +19,7 @@ from apex_ompl.util.display import counted
 LEAST = 4  # joints of an arm
 FINGER = re.compile(r"finger|gripper|thumb|index|middle|ring_|little|pinky|hand_|jaw|knuckle|grip", re.I)
 LEG = re.compile(r"(?<![a-z])legs?(?![a-z])|hip_|_hip|knee|ankle|foot|thigh|calf|wheel|caster|steer|_leg|leg_", re.I)
+WHEEL = re.compile(r"wheel|caster", re.I)
 RANGE = {"revolute": 3.141593, "prismatic": 0.5}  # assumed to either side where the URDF has none [rad, m]
 SPEED = {"revolute": 2.0, "continuous": 2.0, "prismatic": 0.1}  # assumed where the URDF has none [rad/s, m/s]
 FASTEST = 50.0  # speeds beyond are placeholders [rad/s]
@@ -215,6 +216,19 @@ def locked_values(robot: Description, planned: Iterable[str], state: dict[str, f
             value = min(max(value, joint.lower), joint.upper)
         values[joint.name] = round(value, 6) + 0.0
     return values
+
+
+def carriers(robot: Description, arms: Iterable[Arm]) -> list[str]:
+    """Return the joints with one degree of freedom that carry arms and are in none, such as those of a torso."""
+    arms = list(arms)
+    planned = {joint for arm in arms for joint in arm.joints}
+    above = (joint for arm in arms for joint in robot.ancestors(robot.joints[arm.joints[0]].parent))
+    return list(dict.fromkeys(joint.name for joint in above if joint.free and joint.name not in planned))
+
+
+def drives(robot: Description) -> bool:
+    """Whether a robot has a base that drives: planar or floating joints, or wheels."""
+    return any(joint.kind in ("planar", "floating") or WHEEL.search(joint.name) for joint in robot.joints.values())
 
 
 def preferred_state(semantics: Semantics | None, joints: Iterable[str]) -> tuple[str, dict[str, float]]:
