@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import DATA, HOME, WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs, resolve
+from apex_ompl.robot.joint_order import name_back, names_in_order
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array, Flags
@@ -387,7 +388,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         raise FileFormatError(str(path), "locked", both, "expected joints that are not planned (joints)")
     composition = compose(config, path.parent)
     try:
-        model = pin.buildModelFromXML(composition.urdf, mimic=True)
+        urdf, old = names_in_order(composition.urdf)
+        model = pin.buildModelFromXML(urdf, mimic=True)
+        name_back(model, old)
         geometry = pin.buildGeomFromUrdfString(model, composition.urdf, pin.GeometryType.COLLISION)
     except Exception as error:  # Pinocchio's parser raises several kinds
         raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error

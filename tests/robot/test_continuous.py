@@ -126,8 +126,9 @@ def test_a_pose_is_reached_by_the_nearest_turn(robot: Robot) -> None:
 
 def test_joints_that_mimic_an_endless_one_turn_with_it_or_are_refused(tmp_path: Path) -> None:
     pointer = '<link name="pointer"/>' + JOINT.format(
-        name="upon", axis="0 0 1", at=0.1, above="base", below="pointer"
+        name="follow", axis="0 0 1", at=0.1, above="base", below="pointer"
     ).replace('type="revolute"', 'type="continuous"')
+    # "follow" comes before "turn" by name, and joints that mimic others come after them in Pinocchio's models
     for multiplier, fault in (("-2", ""), ("0.5", "mimics 'turn', which turns without end")):
         mimic = f'<mimic joint="turn" multiplier="{multiplier}"/></joint>'
         file = write_endless(tmp_path, more=pointer.replace("</joint>", mimic))
@@ -136,6 +137,9 @@ def test_joints_that_mimic_an_endless_one_turn_with_it_or_are_refused(tmp_path: 
                 load_robot(file)
             continue
         found = load_robot(file)
+        assert {"turn", "follow"} <= {*found.model.names} and found.model.existJointName("follow")
+        angle = found.link_pose(np.array([0.3, 0.0, 0.0]), "pointer")
+        assert math.atan2(angle[1, 0], angle[0, 0]) == pytest.approx(-0.6)
         assert list(found.continuous) == [True, False, False]
         assert np.allclose(*(found.link_pose(np.array([q, 0, 0]), "pointer") for q in (0.3, 0.3 + TURN)), atol=1e-9)
 
