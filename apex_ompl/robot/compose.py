@@ -380,8 +380,8 @@ def _check_followers(root: ET.Element) -> None:
             continue
         if joint.get("type") == CONTINUOUS:
             joint.set("type", "revolute")
-            for limit in joint.findall("limit"):
-                joint.remove(limit)
+            for old in joint.findall("limit"):
+                joint.remove(old)
             ends = {"lower": f"{-WIDEST:g}", "upper": f"{WIDEST:g}"}
             ET.SubElement(joint, "limit", ends | {"velocity": "1", "effort": "0"})
         driver = joints.get(mimic.get("joint"))

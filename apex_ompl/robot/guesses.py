@@ -222,7 +222,8 @@ def carriers(robot: Description, arms: Iterable[Arm]) -> list[str]:
     """Return the joints with one degree of freedom that carry arms and are in none, such as those of a torso."""
     arms = list(arms)
     planned = {joint for arm in arms for joint in arm.joints}
-    above = (joint for arm in arms for joint in robot.ancestors(robot.joints[arm.joints[0]].parent))
+    first = (robot.joints[arm.joints[0]].parent for arm in arms)
+    above = (joint for link in first for joint in reversed(list(robot.ancestors(link))))
     return list(dict.fromkeys(joint.name for joint in above if joint.free and joint.name not in planned))
 
 
