@@ -112,7 +112,7 @@ def test_cells_of_continuous_joints_repeat_after_a_turn(axes: int) -> None:
     again[:, joints[0]] += turn * rng.integers(-9, 10, 400)
     at = (states[:, joints[0]] + np.pi) / width[0] % 1.0
     clear = (at > 1e-6) & (at < 1.0 - 1e-6)  # of borders of cells, in spite of rounding
-    assert np.array_equal(bounds([table], 0, again, 0.0 * half, (joints[0],))[clear, 0], found[clear, 0])
+    assert np.array_equal(bounds([table], 0, again, np.zeros_like(half), (joints[0],))[clear, 0], found[clear, 0])
 
 
 def test_what_is_no_number_is_not_proved() -> None:

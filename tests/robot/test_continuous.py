@@ -22,7 +22,7 @@ from apex_ompl.types import Array
 
 TURN = 2.0 * math.pi
 DEGREE = math.pi / 180.0
-WALL = {"name": "wall", "box": [0.9, 0.05, 3.0], "position": [0.55, 0.0, 0.5]}  # the arm does not fit over it
+WALL = {"name": "wall", "box": [0.9, 0.05, 3.0], "position": [0.6, 0.0, 0.5]}
 
 
 def write_endless(folder: Path, joints: tuple[str, ...] = ("turn",), more: str = "") -> Path:
@@ -92,10 +92,13 @@ def test_a_goal_over_the_seam_is_near(robot: Robot) -> None:
         assert np.allclose(*poses, atol=1e-9)
 
 
-def test_the_other_way_round_is_taken_where_the_shorter_one_is_blocked(robot: Robot) -> None:
+def test_the_other_way_round_is_taken_where_the_shorter_one_is_blocked(tmp_path: Path) -> None:
+    file = write_endless(tmp_path, ("turn", "elbow"))
+    file.write_text(file.read_text().replace("shoulder: {home: 0.4,", "shoulder: {home: 1.2, lower: 0.9, upper: 1.4,"))
+    robot = load_robot(file)
     start, goal = np.array([0.5, 1.2, 0.3]), np.array([-0.5, 1.2, 0.3])
     checker = CollisionChecker(robot, problem(robot, start, goal, (WALL,)).scene)
-    assert not any(checker.is_free(np.array([0.0, *q])) for q in product(np.linspace(-2, 2, 9), np.linspace(-3, 3, 9)))
+    assert not any(checker.is_free(np.array([0.0, *q])) for q in product([0.9, 1.1, 1.4], np.linspace(-3, 3, 9)))
     for planner in ("apex", "rrtconnect"):
         result = plan(problem(robot, start, goal, (WALL,)), planner, timeout=20.0)
         assert result.path is not None, result.reason
