@@ -143,7 +143,11 @@ class SolveContext:
 
     def spline_path(self, control: Array) -> Path:
         """Return the path of control points, shape (points, dof)."""
-        return Path.on(self.optimizer.spline, control)
+        return self.weighed(Path.on(self.optimizer.spline, control))
+
+    def weighed(self, path: Path) -> Path:
+        """Return a path whose length weighs the joints as the robot does."""
+        return replace(path, weights=self.kernel.robot.arrays.weight)
 
     def fit(self, states: Array) -> Array:
         """Return control points of the spline nearest to a polyline, shape (points, dof)."""
@@ -166,6 +170,7 @@ class SolveContext:
 
     def accept(self, path: Path) -> None:
         """Add a valid path to OMPL's solutions."""
+        path = self.weighed(path)
         if self.best is None:
             self.report.first_verified = self.validator.knows_obstacles
         self.report.add_solution(self.planner, path, time.perf_counter() - self.started)
@@ -177,6 +182,7 @@ class SolveContext:
         Returns:
             Whether it was accepted.
         """
+        path = self.weighed(path)
         if self.best is not None:
             if path.length > self.best.length - MIN_GAIN:
                 return False

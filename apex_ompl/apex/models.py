@@ -54,7 +54,8 @@ class PerturbationModel:
         queries = [query] if isinstance(query, Query) else list(query)
         rng, size = generator or np.random.default_rng(0), (sampling or self.sampling).temperature * PERTURBATION_SIZE
         optimizer, limits = Optimizer(self.spline), kernel.robot.arrays
-        some = [optimizer.starts(q.start, q.goal, count + 1, rng, size)[1:] for q in queries]
+        sizes = size / limits.weight
+        some = [optimizer.starts(q.start, q.goal, count + 1, rng, sizes)[1:] for q in queries]
         control = np.clip(np.concatenate(some), limits.lower, limits.upper)
         start, goal = (np.repeat([getattr(q, end) for q in queries], count, axis=0) for end in ("start", "goal"))
         return Proposals(self.spline.with_ends(control, start, goal), np.empty(0), {})

@@ -127,9 +127,13 @@ def table_of(robot: Robot, pair: NearPair, cells: Cells) -> ClearanceTable:
 
 
 def table_range(robot: Robot, pair: NearPair) -> tuple[Array, Array]:
-    """Return the lowest and highest values of the joints in a pair's table, shape (1,) to (3,) each."""
-    chosen = list(pair.sources)
-    return robot.limits.lower[chosen] - BEYOND, robot.limits.upper[chosen] + BEYOND
+    """Return the lowest and highest values of the joints in a pair's table, shape (1,) to (3,) each.
+
+    They are a whole turn of continuous joints, after which cells repeat.
+    """
+    chosen, (low, high) = list(pair.sources), robot.range_around()
+    beyond = np.where(robot.continuous[chosen], 0.0, BEYOND)
+    return low[chosen] - beyond, high[chosen] + beyond
 
 
 @weakly_cached

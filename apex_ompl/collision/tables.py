@@ -143,7 +143,8 @@ def tabulate(
     limits = robot.limits
     return robot_tables(
         robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, tree=joint_tree(robot),
-        bodies=bodies, pairs=list(pairs), numbers=numbers, clearances=clearances,
+        bodies=bodies, pairs=list(pairs), numbers=numbers, clearances=clearances, weights=robot.weights,
+        continuous=robot.continuous,
     )  # fmt: skip
 
 
@@ -219,7 +220,8 @@ def stored_tables(
     limits = robot.limits
     parts = [
         robot.urdf.encode(), robot.to_pinocchio(np.arange(float(robot.dof))).tobytes(), limits.lower.tobytes(),
-        limits.upper.tobytes(), b"" if robot.covers is None else read_file(robot.covers, "sphere covers"),
+        limits.upper.tobytes(), robot.weights.tobytes(), robot.continuous.tobytes(),
+        b"" if robot.covers is None else read_file(robot.covers, "sphere covers"),
         json.dumps(clearance_digests(robot), sort_keys=True).encode(),
         *(_of_shape(s.shape, s.joint, s.placement.homogeneous, s.part or s.name) for s in solids),
         repr((robot.name, robot.joint_names, list(meets_scene), list(pairs))).encode(),

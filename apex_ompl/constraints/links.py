@@ -38,8 +38,9 @@ class Links:
         self._turns = [turn[:3, :3] for turn in tree.turns]
         limits = robot.limits
         self.tables: RobotTables = robot_tables(
-            robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, tree=tree, bodies=[], pairs=[]
-        )
+            robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, tree=tree, bodies=[], pairs=[],
+            weights=robot.weights, continuous=robot.continuous,
+        )  # fmt: skip
 
     @classmethod
     def of(cls, robot: Robot) -> Links:

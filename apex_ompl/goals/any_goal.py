@@ -67,8 +67,9 @@ class AnyGoal:
             start: The start, shape (dof,).
         """
         self.robot, self.members = robot, tuple(members)
-        self.states = states[((states >= robot.limits.lower) & (states <= robot.limits.upper)).all(axis=1)]
         self.start = np.clip(start, robot.limits.lower, robot.limits.upper)
+        inside = ((states >= robot.limits.lower) & (states <= robot.limits.upper)).all(axis=1)
+        self.states = robot.turned_to(states[inside], self.start)
 
     @property
     def bounds(self) -> Mapping[str, float]:
@@ -77,7 +78,8 @@ class AnyGoal:
 
     def errors(self, q: Array) -> Mapping[str, float]:
         """Return 0 where a goal is reached at a state, shape (dof,), else the least error relative to the bounds."""
-        reached = bool((np.abs(self.states - q).max(axis=1, initial=0.0) <= single.TOLERANCE).any())
+        turned = self.robot.turned_to(self.states, q)
+        reached = bool((np.abs(turned - q).max(axis=1, initial=0.0) <= single.TOLERANCE).any())
         least = 0.0 if reached else np.inf
         for goal in self.members:
             if not least:
@@ -166,7 +168,7 @@ class AnyGoal:
                 tolerance=single.TOLERANCE, max_steps=single.DESCENT_STEPS,
             )  # fmt: skip
             attempts += each
-            there = ends.states[ends.errors <= 10.0 * single.TOLERANCE]
+            there = self.robot.turned_to(ends.states[ends.errors <= 10.0 * single.TOLERANCE], self.start)
             if isinstance(goal, PoseGoal) and not goal.residual_decides:
                 there = there[[within(goal.errors(q), goal.bounds) for q in there]]
             converged += len(there)

@@ -301,8 +301,9 @@ class _Search:
         return states.clip(self.limits.lower, self.limits.upper)
 
     def descended(self, states: Array, max_steps: int) -> IKDescents:
-        """Return the ends of descents from states, shape (N, dof)."""
-        return self.goal.inverse.descend(states, tolerance=TOLERANCE, max_steps=max_steps)
+        """Return the ends of descents from states, shape (N, dof), continuous joints at most half a turn away."""
+        ends = self.goal.inverse.descend(states, tolerance=TOLERANCE, max_steps=max_steps)
+        return ends._replace(states=self.goal.robot.turned_to(ends.states, self.start))
 
     def returned(self, states: Array) -> Array:
         """Return the ends of descents from states, shape (N, dof), that reach the goal."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.kernel import IKSolver
-from apex_ompl.robot.model import Limits
+from apex_ompl.robot.model import Robot
 from apex_ompl.types import Array
 
 SPACING = 0.1  # between states of a curve, of the joint that moves most [rad]
@@ -61,40 +61,40 @@ class SelfMotions:
 
 
 def search(
-    inverse: IKSolver, limits: Limits, base: Array, rng: np.random.Generator, *, descents: int, most: int
+    inverse: IKSolver, robot: Robot, base: Array, rng: np.random.Generator, *, descents: int, most: int
 ) -> SelfMotions:
     """Find the curves of states that reach the targets of an inverse kinematics, and follow them.
 
     Args:
         inverse: The inverse kinematics.
-        limits: The joint limits.
+        robot: The robot, whose continuous joints end within half a turn of ``base``.
         base: Values of the joints that do not move, and the first state to descend from, shape (dof,).
         rng: Source of random states.
         descents: Most descents from random states.
         most: Number of states after which no further curve is searched for.
     """
-    free = inverse.free
+    free, (lower, upper) = inverse.free, robot.range_around(base)
     shape = (-1, len(base))
     states, curves, missed = np.empty((0, len(base))), list[int](), list[Array]()
     attempts = idle = number = 0
     while attempts < descents and idle < IDLE and len(states) < most:
         seeds = np.tile(base, (min(BATCH, descents - attempts), 1))
         first = 1 if attempts == 0 else 0
-        seeds[first:, free] = rng.uniform(limits.lower[free], limits.upper[free], (len(seeds) - first, len(free)))
+        seeds[first:, free] = rng.uniform(lower[free], upper[free], (len(seeds) - first, len(free)))
         ends = inverse.descend(seeds, tolerance=EXACT, max_steps=DESCENT_STEPS)
         attempts += len(seeds)
-        for q, error in zip(ends.states, ends.errors, strict=True):
+        for q, error in zip(robot.turned_to(ends.states, base), ends.errors, strict=True):
             if not error <= REACHED:
                 missed.append(q)
                 continue
-            away = float(np.abs(states - q).max(axis=1).min(initial=np.inf))
+            away = float(np.abs(robot.turned_to(states, q) - q).max(axis=1).min(initial=np.inf)) if len(states) else np.inf
             redundant = _redundancy(inverse, q) if away > SAME else 0
             if away <= (SPACING if redundant else SAME):
                 idle += 1
                 continue
             idle = 0
-            found = list(_curve(inverse, limits, q)) if redundant == 1 else [q]
-            states = np.concatenate([states, found])
+            found = list(_curve(inverse, robot, q)) if redundant == 1 else [q]
+            states = np.concatenate([states, [robot.turned_to(one, base) for one in found]])
             curves += [number] * len(found)
             number += 1
     return SelfMotions(states, np.array(curves, np.intp), attempts, np.array(missed).reshape(shape))
@@ -110,17 +110,17 @@ def _rank(singular: Array) -> int:
     return int((singular > SINGULAR * singular[0]).sum()) if len(singular) else 0
 
 
-def _curve(inverse: IKSolver, limits: Limits, q: Array) -> Iterator[Array]:
+def _curve(inverse: IKSolver, robot: Robot, q: Array) -> Iterator[Array]:
     """Yield states along the curve through a state, shape (dof,) each, itself first."""
     yield q
     for sign in (1.0, -1.0):
         closed = False
         before, direction = q, sign * _tangent(inverse, q, None)
         for k in range(MOST_STEPS):
-            after = _step(inverse, limits, before, direction)
+            after = _step(inverse, robot, before, direction)
             if after is None:
                 break
-            closed = k > 1 and float(np.abs(after - q).max()) < 0.75 * SPACING
+            closed = k > 1 and float(np.abs(robot.turned_to(after, q) - q).max()) < 0.75 * SPACING
             if closed:
                 break
             yield after
@@ -146,8 +146,9 @@ def _tangent(inverse: IKSolver, q: Array, before: Array | None) -> Array:
     return made
 
 
-def _step(inverse: IKSolver, limits: Limits, q: Array, direction: Array) -> Array | None:
+def _step(inverse: IKSolver, robot: Robot, q: Array, direction: Array) -> Array | None:
     """Return the next state of a curve, shape (dof,), or None where it ends."""
+    limits = robot.limits
     room = np.where(direction > 0.0, limits.upper - q, q - limits.lower) / np.maximum(np.abs(direction), 1e-12)
     step = min(SPACING, float(room[inverse.free].min()))
     while step >= SHORTEST * SPACING:

@@ -12,7 +12,7 @@ from apex_ompl.kernel.compiled.arrays import BINS, FIXED, LIMIT_SLACK, RobotArra
 from apex_ompl.kernel.joint_tree import ClusterBall, JointTree, Member, transformed
 from apex_ompl.kernel.products import product
 from apex_ompl.kernel.tables import BodySpec, RobotTables, pair_runs
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 
 PairRow = tuple[tuple[int, int], int, list[tuple[int, int]]]
 """Two clusters, their lowest common joint, and the pairs of their bodies."""
@@ -29,6 +29,8 @@ def robot_tables(
     pairs: Sequence[tuple[int, int]],
     numbers: Sequence[int] | None = None,
     clearances: Mapping[tuple[int, int], ClearanceTable] | None = None,
+    weights: Array | None = None,
+    continuous: Flags | None = None,
 ) -> RobotTables:
     """Return the tables of a robot.
 
@@ -42,16 +44,24 @@ def robot_tables(
         pairs: Places of the bodies that are checked against each other.
         numbers: Numbers of the bodies outside of the tables; by default their places.
         clearances: Tables of clearances of some of the pairs.
+        weights: What a unit of each planned joint counts in distances, shape (dof,); 1 by default [rad/rad, rad/m].
+        continuous: Which planned joints turn without end, shape (dof,); none by default.
     """
     given = range(len(bodies)) if numbers is None else numbers
-    return _Builder(tree, bodies, lower, upper).tables(name, tuple(joint_names), pairs, given, clearances or {})
+    dof = len(joint_names)
+    weights = np.ones(dof) if weights is None else np.array(weights, float)
+    continuous = np.zeros(dof, bool) if continuous is None else continuous
+    builder = _Builder(tree, bodies, lower, upper, weights, continuous)
+    return builder.tables(name, tuple(joint_names), pairs, given, clearances or {})
 
 
 class _Builder:
     """A tree of joints, and bodies sorted by cluster."""
 
-    def __init__(self, tree: JointTree, bodies: Sequence[BodySpec], lower: Array, upper: Array) -> None:
-        self.tree, self.lower, self.upper = tree, lower, upper
+    def __init__(
+        self, tree: JointTree, bodies: Sequence[BodySpec], lower: Array, upper: Array, weights: Array, continuous: Flags
+    ) -> None:
+        self.tree, self.lower, self.upper, self.weights, self.continuous = tree, lower, upper, weights, continuous
         keys = [self._key(b, k) for k, b in enumerate(bodies)]
         self.clusters = sorted(set(keys))
         branches = [tree.branch(b.joint, tree.home[b.joint]) for b in bodies]
@@ -122,6 +132,8 @@ class _Builder:
             joint_shift=np.array([j.shift for j in joints], float),
             lower=np.array(self.lower, float),
             upper=np.array(self.upper, float),
+            weight=self.weights,
+            continuous=_ints(self.continuous),
             cluster_ball=np.array([[*ball.center, ball.radius] for ball in balls]).reshape(-1, 4),
             cluster_outer=np.array([ball.outer for ball in balls]),
             part_ball=np.array([ball for ball, _ in parts]).reshape(-1, BINS, 4),

@@ -74,12 +74,23 @@ class SearchBuffers:
         return SearchCounts(c[PROVED_STATES], c[OPEN_STATES], c[TRIED_INTERVALS], c[PROVED_INTERVALS])
 
 
+def _draw_range(kernel: Kernel, roots: Array) -> tuple[Array, Array]:
+    """Return the limits, of continuous joints half a turn beyond the roots, shape (N, dof), at most."""
+    limits = kernel.robot.arrays
+    endless = limits.continuous != 0
+    low, high = roots.min(axis=0, initial=np.inf) - math.pi, roots.max(axis=0, initial=-np.inf) + math.pi
+    lower = np.where(endless, np.maximum(limits.lower, low), limits.lower)
+    upper = np.where(endless, np.minimum(limits.upper, high), limits.upper)
+    return lower, upper
+
+
 class TreePair:
     """RRT-Connect on what a kernel proves, from some starts to some goals; it goes on where it stopped.
 
     A share NEAR of the random states is normally distributed around straight lines from starts to goals; the others are
-    uniform in the limits. Where there are guides, states of paths that are nearly free, as of a model's proposals, a
-    share GUIDED of all is normally distributed around these instead (after Ichter, Harrison and Pavone 2018).
+    uniform in the limits, of continuous joints half a turn beyond starts and goals. Where there are guides, states of
+    paths that are nearly free, as of a model's proposals, a share GUIDED of all is normally distributed around these
+    instead (after Ichter, Harrison and Pavone 2018). Distances are Euclidean, with joints weighed.
     States that the kernel cannot prove free count as blocked (:mod:`apex_ompl.kernel.compiled.path.search`).
     """
 
@@ -96,8 +107,9 @@ class TreePair:
             resolution: Largest spacing of the states that are checked along a step [rad, max-norm].
             rng: Source of the random states.
         """
-        limits = kernel.robot.arrays
-        longest = min(max(longest, LEAST_STEP), length(limits.upper - limits.lower))  # no step is longer
+        self._lower, self._upper = _draw_range(kernel, np.concatenate([starts, goals]))
+        weight = kernel.robot.arrays.weight
+        longest = min(max(longest, LEAST_STEP), length((self._upper - self._lower) * weight))  # no step is longer
         self._kernel, self._longest, self._resolution = kernel, longest, resolution
         self._at_once = max(int(AT_ONCE * min(longest, 1.0)), 1)  # short steps are many for each random state
         dof, most = kernel.robot.dof, max(len(starts), len(goals))
@@ -172,27 +184,27 @@ class TreePair:
 
         They are the same however many are drawn at once.
         """
-        limits, dof = self._kernel.robot.arrays, self._starts.shape[1]
+        (lower, upper), dof = (self._lower, self._upper), self._starts.shape[1]
         share, normal = self._rng.random((count, dof + 5)), self._normal_rng.standard_normal((count, dof))
-        states = limits.lower + share[:, :dof] * (limits.upper - limits.lower)
+        states = lower + share[:, :dof] * (upper - lower)
         near = np.flatnonzero(share[:, dof] < NEAR)
         which, along, spread = share[near, dof + 1 : dof + 3], share[near, dof + 3, None], share[near, dof + 4, None]
         starts = self._starts[(which[:, 0] * len(self._starts)).astype(int)]
         goals = self._goals[(which[:, 1] * len(self._goals)).astype(int)]
-        around = starts + along * (goals - starts) + SPREAD * spread * normal[near]
-        states[near] = np.clip(around, limits.lower, limits.upper)
+        around = starts + along * (goals - starts) + SPREAD * spread * normal[near] / self._kernel.robot.arrays.weight
+        states[near] = np.clip(around, lower, upper)
         if len(self._guides):
             self._move_to_guides(states)
         return states
 
     def _move_to_guides(self, states: Array) -> None:
         """Put a share GUIDED of random states around guides."""
-        limits, (count, dof) = self._kernel.robot.arrays, states.shape
+        count, dof = states.shape
         draws, normal = self._guide_rngs[0].random((count, 3)), self._guide_rngs[1].standard_normal((count, dof))
         some = np.flatnonzero(draws[:, 0] < GUIDED)
         chosen = self._guides[(draws[some, 1] * len(self._guides)).astype(int)]
-        apart = GUIDE_SPREAD * draws[some, 2, None] * normal[some]
-        states[some] = np.clip(chosen + apart, limits.lower, limits.upper)
+        apart = GUIDE_SPREAD * draws[some, 2, None] * normal[some] / self._kernel.robot.arrays.weight
+        states[some] = np.clip(chosen + apart, self._lower, self._upper)
 
     def _make_room(self) -> None:
         self._states = np.ascontiguousarray(np.concatenate([self._states, np.zeros_like(self._states)], axis=2))

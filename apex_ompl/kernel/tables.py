@@ -73,6 +73,7 @@ def robot_fault(t: RobotArrays, dof: int, bodies: int) -> str:
 def _length_fault(t: RobotArrays, dof: int, bodies: int) -> str:
     sizes = {"joint": len(t.joint_parent), "cluster": len(t.cluster_joint), "body": bodies}
     sizes |= {"node": len(t.node_first), "pair": len(t.pair_common), "lower": dof, "upper": dof}
+    sizes |= {"weight": dof, "continuous": dof}
     if sizes["joint"] == 0:
         return "joint_parent"
     for name, array in ((name, array) for name, array in t._asdict().items() if name not in MADE):
@@ -89,6 +90,7 @@ def _range_fault(t: RobotArrays, dof: int, bodies: int) -> str:
         "joint_parent": (0, joints), "eager": (1, joints), "lazy": (1, joints), "body_root": (0, nodes),
         "cluster_joint": (0, joints), "body_joint": (0, joints), "pair_clusters": (0, clusters),
         "pair_common": (0, joints), "bodies": (0, bodies), "joint_kind": (FIXED, PRISMATIC + 1),
+        "continuous": (0, 2),
         "joint_source": (-1, dof), "cluster_dof": (-1, dof), "cluster_lazy": (0, len(t.lazy) + 1),
         "cluster_bodies": (0, bodies + 1), "pair_bodies": (0, len(t.bodies) + 1), "node_count": (0, nodes),
     }  # fmt: skip
@@ -105,6 +107,8 @@ def _range_fault(t: RobotArrays, dof: int, bodies: int) -> str:
             return name
     if (t.joint_source[t.joint_kind != FIXED] < 0).any():
         return "joint_source"
+    if not (t.weight > 0.0).all():
+        return "weight"
     for name in ("node_radius", "node_outer", "cluster_outer", "cluster_spread", "cluster_speed"):
         if (getattr(t, name) < 0.0).any():
             return name

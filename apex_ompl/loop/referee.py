@@ -309,4 +309,4 @@ def is_at_goal(robot: Robot, problem: Problem, q: Array, goals: ArrayLike | None
         goals = robot.within_limits(problem.goal_states(robot.joint_names))
     states = np.atleast_2d(np.asarray(goals, float))
     check_states(states, robot.dof, "goals")
-    return bool((np.abs(states - q).max(axis=1, initial=0.0) <= SAME_STATE).any())
+    return bool((np.abs(robot.turned_to(states, q) - q).max(axis=1, initial=0.0) <= SAME_STATE).any())

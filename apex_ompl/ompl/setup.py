@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from typing import TYPE_CHECKING
 from weakref import ref
 
@@ -23,6 +24,7 @@ from apex_ompl.ompl.simple_setup import SimpleSetup
 from apex_ompl.ompl.space import Bounds, to_state
 from apex_ompl.ompl.validity import ConstrainedMotionCheck, MotionCheck, MotionValidator, StateValidityChecker
 from apex_ompl.robot import Robot, load_robot
+from apex_ompl.robot.model import TURN
 from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import problem_at
@@ -36,6 +38,8 @@ if TYPE_CHECKING:
 
 GOAL_STATES = 8  # how many states an alignment goal is sampled into
 GOAL_ATTEMPTS = 200
+TURNED_GOALS = 16  # most goals, among them those that differ by whole turns of continuous joints
+SAME_ANGLE = 1e-9  # by which a joint that stays may be off after whole turns [rad]
 HELD_WIDTH = 1e-9  # half width of the bounds of joints that stay, for splines that are evaluated with rounding [rad]
 
 
@@ -130,16 +134,8 @@ def assemble(
     """
     robot = robot or load_robot(problem.robot)
     names = robot.joint_names
-    asked = problem.start_state(names)
-    start = robot.within_limits(asked)
-    given_goals = problem.goal_states(names)
-    goals = robot.within_limits(given_goals)
-    notes = _moved_notes(robot, asked, start, "start")
-    for k, (given_goal, goal) in enumerate(zip(given_goals, goals, strict=True)):
-        notes += _moved_notes(robot, given_goal, goal, "goal" if len(goals) == 1 else f"goal {k}")
     held = np.array([k for k, name in enumerate(names) if moving is not None and name not in moving], np.intp)
-    stays = given_goals[:, held] == asked[held]
-    goals[:, held] = np.where(stays, start[held], goals[:, held])  # where it is moved to
+    start, goals, notes = _ends(problem, robot, held)
     lower, upper = bounds = _bounds(robot, start, held)
     limits = replace(robot.limits, lower=lower, upper=upper)
     sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)
@@ -157,9 +153,10 @@ def assemble(
             sampling = sample_on_constraints(
                 sampled, along, checker, rng, known=sampling, count=GOAL_STATES, max_attempts=GOAL_ATTEMPTS
             )
-        goals = sampling.states
+        goals = robot.turned_to(sampling.states, start)
         goals[:, held] = start[held]
         goal_faults = ("",) * len(goals) or (sampling.fault,)
+    goals, goal_faults = _turned_goals(robot, start, goals, goal_faults, held)
     if along is not None:
         bounds = _bounds(robot, start, _resting(along, start, goals, held))
     simple_setup = SimpleSetup(robot, bounds, along)
@@ -229,6 +226,23 @@ def constraint_set(
     return ConstraintSet.of(robot, (*problem.constraints, *constraints), problem.attached, start, fixed)
 
 
+def _ends(problem: Problem, robot: Robot, held: NDArray[np.intp]) -> tuple[Array, Array, list[str]]:
+    """Return the start, shape (dof,), the goals nearest to it, shape (N, dof), and notes on joints that were moved.
+
+    Joints a little outside their limits are moved to them, goals of continuous joints by whole turns.
+    """
+    asked, given_goals = problem.start_state(robot.joint_names), problem.goal_states(robot.joint_names)
+    start, goals = robot.within_limits(asked), robot.within_limits(given_goals)
+    notes = _moved_notes(robot, asked, start, "start")
+    for k, (given_goal, goal) in enumerate(zip(given_goals, goals, strict=True)):
+        notes += _moved_notes(robot, given_goal, goal, "goal" if len(goals) == 1 else f"goal {k}")
+    goals = robot.turned_to(goals, start)
+    stays = given_goals[:, held] == asked[held]
+    stays |= robot.continuous[held] & np.isclose(goals[:, held], start[held], 0.0, SAME_ANGLE)
+    goals[:, held] = np.where(stays, start[held], goals[:, held])  # where it is moved to
+    return start, goals, notes
+
+
 def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[str]:
     """Return a note on each joint of a start or a goal that was moved to its limit."""
     return [
@@ -239,11 +253,46 @@ def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[st
 
 
 def _bounds(robot: Robot, start: Array, held: NDArray[np.intp]) -> Bounds:
-    """Return the robot's limits, narrowed to the start for joints that stay."""
-    lower, upper = robot.limits.lower.copy(), robot.limits.upper.copy()
+    """Return the robot's limits, narrowed to the start for joints that stay, to a turn to either side if continuous."""
+    lower, upper = robot.range_around(start, turns=1.0)
     lower[held] = np.maximum(lower[held], start[held] - HELD_WIDTH)
     upper[held] = np.minimum(upper[held], start[held] + HELD_WIDTH)
     return lower, upper
+
+
+def _turned_goals(
+    robot: Robot, start: Array, goals: Array, faults: tuple[str, ...], held: NDArray[np.intp]
+) -> tuple[Array, tuple[str, ...]]:
+    """Return goals, shape (N, dof), and the same after whole turns of continuous joints, with the fault of each.
+
+    The given ones, which are the nearest to the start, come first; then others at most a turn from it, the nearest
+    first, up to TURNED_GOALS in all.
+    """
+    free = np.flatnonzero(robot.continuous & ~np.isin(np.arange(robot.dof), held))
+    room = TURNED_GOALS - len(goals)
+    if not len(free) or not len(goals) or room <= 0:
+        return goals, faults
+    low, high = _bounds(robot, start, held)
+    turned = [
+        (float(np.linalg.norm(q - start)), k, q)
+        for k, goal in enumerate(goals)
+        for q in _by_one_turn(goal, free)
+        if ((q >= low) & (q <= high)).all()
+    ]
+    turned.sort(key=lambda one: one[:2])
+    more = turned[:room]
+    return np.concatenate([goals, *(q[None] for _, _, q in more)]), (*faults, *(faults[k] for _, k, _ in more))
+
+
+def _by_one_turn(goal: Array, joints: NDArray[np.intp]) -> list[Array]:
+    """Return a state, shape (dof,), with one or two of some joints a turn further or less."""
+    found = []
+    for some in (*combinations(joints, 1), *combinations(joints, 2)):
+        for turns in product((-TURN, TURN), repeat=len(some)):
+            q = goal.copy()
+            q[list(some)] += turns
+            found.append(q)
+    return found
 
 
 def _stop_of(validator: MotionValidator) -> Callable[[], bool]:
@@ -296,7 +345,7 @@ def workspace_goal(robot: Robot, problem: Problem) -> AlignmentGoal | PoseGoal |
         if isinstance(found, AnyGoal):
             members += found.members
         elif found is None:
-            states.append(robot.within_limits(one.goal_states(robot.joint_names)))
+            states.append(robot.turned_to(robot.within_limits(one.goal_states(robot.joint_names)), start))
         else:
             members.append(found)
     return AnyGoal(robot, members, np.concatenate(states), start)

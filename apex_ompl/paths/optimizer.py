@@ -146,12 +146,14 @@ class Optimizer:
     def _sampled(self, samples: int) -> Optimizer:
         return Optimizer(self.spline, replace(self.settings, samples=samples), costs=self.costs)
 
-    def starts(self, start: Array, goal: Array, count: int, rng: np.random.Generator, size: float = 1.0) -> Array:
+    def starts(
+        self, start: Array, goal: Array, count: int, rng: np.random.Generator, size: ArrayLike = 1.0
+    ) -> Array:  # fmt: skip
         """Return straight lines between two states, randomly perturbed: control points of shape (count, points, dof).
 
         The first is the line itself. The perturbations are normal, and their inverse covariance is the integral of
         the squared acceleration (the prior of STOMP, Kalakrishnan et al. 2011). ``size`` is the largest standard
-        deviation of a joint along the path [rad].
+        deviation of a joint along the path, or those of all, shape (dof,) [rad, m].
 
         Raises:
             ParameterError: ``count`` is not positive.
@@ -162,7 +164,7 @@ class Optimizer:
         perturbations = product(_perturbation_factor(self.spline), normal)
         perturbations[0] = 0.0
         paths = np.repeat(line[None], count, axis=0)
-        paths[:, self.spline.inner] += size * perturbations
+        paths[:, self.spline.inner] += np.asarray(size) * perturbations
         return paths
 
     def evaluate(self, kernel: Kernel, control: ArrayLike) -> tuple[OptimizationResult, Array]:

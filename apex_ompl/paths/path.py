@@ -33,11 +33,14 @@ class Path:
         states: Waypoints, shape (N, dof) [rad; synergies 0..1].
         spline: B-spline basis, or None for a polyline.
         control: Control points of the spline, shape (points, dof), or None.
+        weights: What a unit of each joint counts in the length, shape (dof,), or None where all count 1, see
+            ``Robot.weights``.
     """
 
     states: Array
     spline: Spline | None = None
     control: Array | None = None
+    weights: Array | None = None
 
     def __post_init__(self) -> None:
         """Check the shapes.
@@ -67,8 +70,8 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Sum of Euclidean joint-space steps between the states [rad]; S_r of the paper."""
-        return path_length(self.states)
+        """Sum of Euclidean joint-space steps between the states, of weighed joints [rad]; S_r of the paper."""
+        return path_length(self.states, self.weights)
 
     def __repr__(self) -> str:
         """Return the numbers of states and joints, and the kind of the path."""
@@ -140,9 +143,15 @@ class Path:
         return np.concatenate(pieces)
 
 
-def path_length(states: Array) -> float:
-    """Return the sum of Euclidean joint-space steps of a path, shape (N, dof) [rad]; S_r of the paper."""
-    return float(np.linalg.norm(np.diff(states, axis=0), axis=1).sum())
+def path_length(states: Array, weights: Array | None = None) -> float:
+    """Return the sum of Euclidean joint-space steps of a path, shape (N, dof) [rad]; S_r of the paper.
+
+    Args:
+        states: The path.
+        weights: What a unit of each joint counts, shape (dof,); None for 1.
+    """
+    steps = np.diff(states, axis=0)
+    return float(np.linalg.norm(steps if weights is None else steps * weights, axis=1).sum())
 
 
 def resample(states: Array, count: int) -> Array:

@@ -223,7 +223,7 @@ class _Part:
         """Return states that reach the poses; of a region, in equal shares for the poses drawn in it."""
         each, most, found = -(-descents // len(self.goals)), MOST_STATES // len(self.goals), list[SelfMotions]()
         for goal, inverse in zip(self.goals, self.inverses, strict=True):
-            one = search(inverse, self.robot.limits, self.base, rng, descents=each, most=most)
+            one = search(inverse, self.robot, self.base, rng, descents=each, most=most)
             if not goal.residual_decides:
                 inside = np.array([within(goal.errors(q), goal.bounds) for q in one.states], bool)
                 one = replace(one, states=one.states[inside], curves=one.curves[inside])

@@ -276,9 +276,10 @@ def time(proved: ProvedPath, timing: bool | Timing = True) -> PlanResult:
 
 def finish(query: PlanQuery, result: PlanResult) -> PlanResult:
     """Return a result with its length, the number of states that were checked, and the times up to now."""
-    length = nan if result.path is None else result.path.length
+    path = None if result.path is None else replace(result.path, weights=query.setup.robot.weights)
+    length = nan if path is None else path.length
     times = {**query.times, "total": clock.perf_counter() - query.started}
-    return replace(result, length=length, checks=query.setup.checker.check_counts.states, times=times)
+    return replace(result, path=path, length=length, checks=query.setup.checker.check_counts.states, times=times)
 
 
 def with_exact_ends(setup: PlanningSetup, path: Path) -> Path:

@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.errors import MissingFileError, RobotError
-from apex_ompl.robot.config import Joint, Part, RobotConfig, resolve
+from apex_ompl.robot.config import WIDEST, Joint, Part, RobotConfig, resolve
 from apex_ompl.scene.bodies import pose_matrix
 from apex_ompl.scene.mesh_files import UPRIGHT, collada_asset
 from apex_ompl.types import Array
@@ -37,7 +37,9 @@ JOINT = {
 
 WORLD = "world"  # the root link; a link of a part that has this name gets that of the part before it
 LIMITED = ("revolute", "prismatic")  # joints that need limits
-MOVING = (*LIMITED, "continuous", "planar")  # joints that need an axis
+CONTINUOUS = "continuous"
+AT_BASE = ("plane", "along_x", "along_y")  # links of a planar base, from its mount on
+MOVING = (*LIMITED, CONTINUOUS, "planar")  # joints that need an axis
 TYPES = (*MOVING, "fixed", "floating")
 
 
@@ -191,7 +193,7 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
         roots = [n for n in names if n not in children]
         if len(roots) != 1:
             raise RobotError(f"part {part.name!r}: expected one root link, found {', '.join(roots) or 'none'}")
-        _mount(root, part, roots[0])
+        names += _mount(root, part, roots[0])
         links.update(names)
         part_links[part.name] = tuple(names)
         if part.srdf:
@@ -199,6 +201,7 @@ def compose(config: RobotConfig, folder: Path) -> Composition:
             found = parse_xml(files[-1]).iter("disable_collisions")
             pairs = [(rename(e.get("link1", "")), rename(e.get("link2", ""))) for e in found]
             disabled += [(a, b) for a, b in pairs if a in names and b in names]
+    _check_followers(root)
     _lock_all(root, config.locked)
     files += [Path(mesh.get("filename", "").removeprefix("file://")) for mesh in root.iter("mesh")]
     return Composition(ET.tostring(root, encoding="unicode"), disabled, part_links, tuple(dict.fromkeys(files)))
@@ -225,17 +228,25 @@ def parse_xml(path: Path, text: str | None = None) -> ET.Element:
 
 
 def _give_limits(joint: ET.Element, given: Joint | None) -> None:
-    """Write limits of the robot file into a planned joint; a continuous joint with a range becomes revolute."""
-    if given is None or joint.get("type") not in (*LIMITED, "continuous"):
+    """Write limits of the robot file into a planned joint; one that is continuous becomes revolute.
+
+    Without a range in the robot file, the limits of a continuous joint are the widest.
+
+    Raises:
+        RobotError: Only one end of the range of a continuous joint is given.
+    """
+    if given is None or joint.get("type") not in (*LIMITED, CONTINUOUS):
         return
     values = {"lower": given.lower, "upper": given.upper, "velocity": given.velocity}
     known = {name: f"{value:.17g}" for name, value in values.items() if value is not None}
-    bounded = {"lower", "upper"} <= known.keys()
-    if joint.get("type") == "continuous" and not bounded:
-        return
-    if joint.get("type") == "continuous":
+    if joint.get("type") == CONTINUOUS:
+        ends = {"lower", "upper"} & known.keys()
+        if len(ends) == 1:
+            expected = "expected lower and upper, or neither of them for a joint that turns without end"
+            raise RobotError(f"joint {joint.get('name')!r} is continuous and has {ends.pop()} alone, {expected}")
+        known = {"lower": f"{-WIDEST:g}", "upper": f"{WIDEST:g}"} | known
         joint.set("type", "revolute")
-    if known and bounded:
+    if {"lower", "upper"} <= known.keys():
         limit = joint.find("limit")
         limit = ET.SubElement(joint, "limit") if limit is None else limit
         limit.attrib.update(known)
@@ -331,11 +342,57 @@ def _resolved(name: str, folders: tuple[Path, Path], role: str, packages: Mappin
     return resolve(name, folders[1], role, packages)
 
 
-def _mount(root: ET.Element, part: Part, child: str) -> None:
-    joint = ET.SubElement(root, "joint", name=f"{part.name}_mount", type="fixed")
+def _mount(root: ET.Element, part: Part, child: str) -> list[str]:
+    """Fix a part to its parent, or let it drive on a plane there; return the names of the links that are added."""
+    planar, name = part.planar, part.name
+    ends = [part.parent, child] if planar is None else [part.parent, *(f"{name}_{at}" for at in AT_BASE), child]
+    for link in ends[1:-1]:
+        ET.SubElement(root, "link", name=link)
+    joint = _joint_between(root, f"{name}_mount", "fixed", ends[0], ends[1])
     _set_origin(joint, pose_matrix(part.position, part.orientation))
-    ET.SubElement(joint, "parent", link=part.parent)
+    if planar is None:
+        return []
+    axes = (("x", "1 0 0", planar.x), ("y", "0 1 0", planar.y), ("yaw", "0 0 1", (-WIDEST, WIDEST)))
+    for (axis, along, (low, high)), first, second in zip(axes, ends[1:-1], ends[2:], strict=True):
+        joint = _joint_between(root, f"{name}_{axis}", "revolute" if axis == "yaw" else "prismatic", first, second)
+        ET.SubElement(joint, "axis", xyz=along)
+        ET.SubElement(joint, "limit", lower=f"{low:.17g}", upper=f"{high:.17g}", velocity="1", effort="0")
+    return ends[1:-1]
+
+
+def _joint_between(root: ET.Element, name: str, kind: str, parent: str, child: str) -> ET.Element:
+    joint = ET.SubElement(root, "joint", name=name, type=kind)
+    ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
+    return joint
+
+
+def _check_followers(root: ET.Element) -> None:
+    """Make continuous joints that mimic others revolute, and check those that mimic joints that turn without end.
+
+    Raises:
+        RobotError: After a whole turn of a joint that turns without end, one that mimics it is elsewhere.
+    """
+    joints = {joint.get("name"): joint for joint in root.findall("joint")}
+    for name, joint in joints.items():
+        mimic = joint.find("mimic")
+        if mimic is None:
+            continue
+        if joint.get("type") == CONTINUOUS:
+            joint.set("type", "revolute")
+            for old in joint.findall("limit"):
+                joint.remove(old)
+            ends = {"lower": f"{-WIDEST:g}", "upper": f"{WIDEST:g}"}
+            ET.SubElement(joint, "limit", ends | {"velocity": "1", "effort": "0"})
+        driver = joints.get(mimic.get("joint"))
+        limit = None if driver is None else driver.find("limit")
+        if driver is None or limit is None or driver.get("type") != "revolute" or joint.get("type") == "fixed":
+            continue
+        endless = float(limit.get("lower", "0")) <= -WIDEST and float(limit.get("upper", "0")) >= WIDEST
+        whole = joint.get("type") == "revolute" and float(mimic.get("multiplier", "1")).is_integer()
+        if endless and not whole:
+            expected = f"expected limits of {driver.get('name')!r}, or a revolute joint with a whole multiplier"
+            raise RobotError(f"joint {name!r} mimics {driver.get('name')!r}, which turns without end, {expected}")
 
 
 def _lock_all(root: ET.Element, locked: Mapping[str, float]) -> None:
@@ -368,7 +425,7 @@ def _lock(root: ET.Element, name: str, value: float) -> None:
     if kind in ("floating", "planar") and value == 0.0:
         _fix(joint, origin_of(joint, f"joint {name!r}"))
         return
-    if kind not in (*LIMITED, "continuous"):
+    if kind not in (*LIMITED, CONTINUOUS):
         expected = "0 for a floating or planar joint, else revolute, continuous or prismatic"
         raise RobotError(f"locked: the joint {name!r} is {kind} and its value {value:g}, expected {expected}")
     axis_element = joint.find("axis")

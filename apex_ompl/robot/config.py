@@ -27,32 +27,6 @@ DATA = Path(__file__).parent / "data"
 EXTRA = "example-robot-data"  # the package of the extra
 
 
-class Part(StrictModel):
-    """A URDF that is mounted on the world or on a link of an earlier part.
-
-    Attributes:
-        name: Name of the part.
-        urdf: URDF file, as a ``package://`` URI or a path relative to the robot file.
-        srdf: SRDF file whose ``disable_collisions`` are used.
-        prefix: Prefix of the names of all links and joints.
-        rename: Old -> new start of names, replaced before ``prefix`` is added.
-        remove: Links that are removed together with their descendants.
-        parent: ``world``, or the link of an earlier part that carries this one.
-        position: Placement of the part's root link in ``parent`` [m].
-        orientation: The same, quaternion xyzw.
-    """
-
-    name: Name
-    urdf: str
-    srdf: str | None = None
-    prefix: str = ""
-    rename: dict[str, str] = {}
-    remove: tuple[str, ...] = ()
-    parent: str = "world"
-    position: Vector = (0.0, 0.0, 0.0)
-    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
-
-
 class Joint(StrictModel):
     """A planned joint and its limits [rad, rad/s, rad/s^2, rad/s^3, Nm; no limit of jerk or effort is ``.inf``].
 
@@ -68,6 +42,71 @@ class Joint(StrictModel):
     acceleration: PositiveFloat
     jerk: Annotated[float, Field(gt=0.0, allow_inf_nan=True)]
     effort: Annotated[float, Field(gt=0.0, allow_inf_nan=True)] = math.inf
+
+
+class Planar(StrictModel):
+    """A base that drives on a plane: planned joints PART_x, PART_y and PART_yaw, which turns without end.
+
+    Attributes:
+        x: Range along x of the frame that carries the base [m].
+        y: Range along y [m].
+        velocity: Largest velocity along x and y, and about z [m/s, rad/s].
+        acceleration: The same for accelerations [m/s^2, rad/s^2].
+        jerk: The same for jerks [m/s^3, rad/s^3].
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    velocity: tuple[PositiveFloat, PositiveFloat] = (0.5, 1.0)
+    acceleration: tuple[PositiveFloat, PositiveFloat] = (0.5, 1.0)
+    jerk: tuple[PositiveFloat, PositiveFloat] = (5.0, 10.0)
+
+    @model_validator(mode="after")
+    def _ranges(self) -> Self:
+        for name, (low, high) in (("x", self.x), ("y", self.y)):
+            if not low < high:
+                raise ValueError(f"{name}: expected a range with lowest < highest, got {low:g} and {high:g}")
+        return self
+
+    def joints(self, part: str) -> dict[str, Joint]:
+        """Return the joints of the base of a part, x, y and yaw, by name."""
+        found = {}
+        for axis, ends, k in (("x", self.x, 0), ("y", self.y, 0), ("yaw", (None, None), 1)):
+            low, high = ends
+            home = 0.0 if low is None or high is None else min(max(0.0, low), high)
+            found[f"{part}_{axis}"] = Joint(
+                home=home, lower=low, upper=high,
+                velocity=self.velocity[k], acceleration=self.acceleration[k], jerk=self.jerk[k],
+            )  # fmt: skip
+        return found
+
+
+class Part(StrictModel):
+    """A URDF that is mounted on the world or on a link of an earlier part.
+
+    Attributes:
+        name: Name of the part.
+        urdf: URDF file, as a ``package://`` URI or a path relative to the robot file.
+        srdf: SRDF file whose ``disable_collisions`` are used.
+        prefix: Prefix of the names of all links and joints.
+        rename: Old -> new start of names, replaced before ``prefix`` is added.
+        remove: Links that are removed together with their descendants.
+        parent: ``world``, or the link of an earlier part that carries this one.
+        position: Placement of the part's root link in ``parent`` [m].
+        orientation: The same, quaternion xyzw.
+        planar: The root link drives on the plane z = 0 of that placement.
+    """
+
+    name: Name
+    urdf: str
+    srdf: str | None = None
+    prefix: str = ""
+    rename: dict[str, str] = {}
+    remove: tuple[str, ...] = ()
+    parent: str = "world"
+    position: Vector = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (0.0, 0.0, 0.0, 1.0)
+    planar: Planar | None = None
 
 
 class Hand(StrictModel):
@@ -124,15 +163,26 @@ class RobotConfig(StrictModel):
         """Return package name -> folder for a robot file in ``folder``."""
         return {name: folder / path for name, path in self.packages.items()}
 
+    def with_bases(self) -> RobotConfig:
+        """Return the same robot with the joints of its planar bases, each a group PART_base, before all others.
+
+        Joints that the file has of a base replace those of ``planar``, at their place.
+        """
+        bases = {part.name: part.planar.joints(part.name) for part in self.parts if part.planar is not None}
+        added = {name: joint for base in bases.values() for name, joint in base.items() if name not in self.joints}
+        groups = {f"{part}_base": tuple(base) for part, base in bases.items()}
+        return self.model_copy(update={"joints": added | self.joints, "groups": groups | self.groups})
+
     @model_validator(mode="after")
     def _known_joints(self) -> Self:
+        joints = self.with_bases().joints
         for group, names in self.groups.items():
             for name in names:
-                if name not in self.joints:
+                if name not in joints:
                     raise ValueError(f"group {group!r} names the unknown joint {name!r}")
         for pose, values in self.poses.items():
             for name in values:
-                if name not in self.joints:
+                if name not in joints:
                     raise ValueError(f"pose {pose!r} names the unknown joint {name!r}")
         if HOME in self.poses:
             raise ValueError(f"expected {HOME!r} as the home of each joint and not among the poses")

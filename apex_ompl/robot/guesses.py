@@ -19,7 +19,7 @@ from apex_ompl.util.display import counted
 LEAST = 4  # joints of an arm
 FINGER = re.compile(r"finger|gripper|thumb|index|middle|ring_|little|pinky|hand_|jaw|knuckle|grip", re.I)
 LEG = re.compile(r"(?<![a-z])legs?(?![a-z])|hip_|_hip|knee|ankle|foot|thigh|calf|wheel|caster|steer|_leg|leg_", re.I)
-TURN = round(2.0 * math.pi, 6)  # range of a continuous joint to either side [rad]
+WHEEL = re.compile(r"wheel|caster", re.I)
 RANGE = {"revolute": 3.141593, "prismatic": 0.5}  # assumed to either side where the URDF has none [rad, m]
 SPEED = {"revolute": 2.0, "continuous": 2.0, "prismatic": 0.1}  # assumed where the URDF has none [rad/s, m/s]
 FASTEST = 50.0  # speeds beyond are placeholders [rad/s]
@@ -190,8 +190,7 @@ def joint_record(joint: UrdfJoint) -> tuple[dict[str, float], list[str]]:
     record: dict[str, float] = {}
     notes = []
     if joint.kind == "continuous":
-        record |= {"lower": -TURN, "upper": TURN}
-        notes.append("continuous, planned from -2 pi to 2 pi")
+        notes.append("turns without end; give lower and upper if cables or hoses do not allow that")
     elif math.isnan(joint.lower):
         record |= {"lower": -RANGE[joint.kind], "upper": RANGE[joint.kind]}
         notes.append("no range in the URDF, assumed")
@@ -199,7 +198,7 @@ def joint_record(joint: UrdfJoint) -> tuple[dict[str, float], list[str]]:
     if math.isnan(velocity) or velocity > FASTEST:
         velocity = record["velocity"] = SPEED[joint.kind]
         notes.append("no velocity in the URDF, assumed")
-    if {"lower", "upper"} <= record.keys():
+    if joint.kind == "continuous" or {"lower", "upper"} <= record.keys():
         record["velocity"] = velocity
     record |= {"acceleration": float(f"{RAMP * velocity:.4g}"), "jerk": float(f"{JERK * velocity:.4g}")}
     return record, notes
@@ -217,6 +216,20 @@ def locked_values(robot: Description, planned: Iterable[str], state: dict[str, f
             value = min(max(value, joint.lower), joint.upper)
         values[joint.name] = round(value, 6) + 0.0
     return values
+
+
+def carriers(robot: Description, arms: Iterable[Arm]) -> list[str]:
+    """Return the joints with one degree of freedom that carry arms and are in none, such as those of a torso."""
+    arms = list(arms)
+    planned = {joint for arm in arms for joint in arm.joints}
+    first = (robot.joints[arm.joints[0]].parent for arm in arms)
+    above = (joint for link in first for joint in reversed(list(robot.ancestors(link))))
+    return list(dict.fromkeys(joint.name for joint in above if joint.free and joint.name not in planned))
+
+
+def drives(robot: Description) -> bool:
+    """Whether a robot has a base that drives: planar or floating joints, or wheels."""
+    return any(joint.kind in ("planar", "floating") or WHEEL.search(joint.name) for joint in robot.joints.values())
 
 
 def preferred_state(semantics: Semantics | None, joints: Iterable[str]) -> tuple[str, dict[str, float]]:

@@ -58,7 +58,8 @@ def find_home(
         if not checks.colliding(given).any():
             return Home(_rounded(given), "the state of the SRDF, which is free")
         free = _enough(robot, checks, free)
-        near = free[np.abs((free - given) / (robot.limits.upper - robot.limits.lower)).sum(axis=1).argsort()]
+        low, high = robot.range_around()
+        near = free[np.abs((robot.turned_to(free, given) - given) / (high - low)).sum(axis=1).argsort()]
         return _first(robot, checks, near, "the free one of random states that is closest to the SRDF's, which touches")
     free = _enough(robot, checks, free)
     alike = _alike(robot, free)
@@ -105,7 +106,7 @@ def _none(robot: Robot, checks: SelfCollision) -> RobotError:
 
 
 def _inside(robot: Robot, q: Array) -> Array:
-    low, high = robot.limits.lower, robot.limits.upper
+    low, high = robot.range_around()
     room = MARGIN * (high - low)
     return np.asarray(np.clip(q, low + room, high - room))
 
@@ -118,7 +119,7 @@ def _alike(robot: Robot, states: Array) -> Array:
     """Return states whose groups all stand as the first, with joints whose limits are mirrored turned round."""
     groups = list(robot.groups.values())
     alike = states.copy()
-    low, high = robot.limits.lower, robot.limits.upper
+    low, high = robot.range_around()
     first = groups[0]
     for group in groups[1:]:
         if len(group) != len(first):
@@ -135,7 +136,7 @@ def _quality(robot: Robot, q: Array) -> float:
     """Return how good a home a state is: the least singular value of an arm, less where joints are close to limits."""
     model, data = robot.model, robot.model.createData()
     pin.computeJointJacobians(model, data, robot.to_pinocchio(q))
-    low, high = robot.limits.lower, robot.limits.upper
+    low, high = robot.range_around()
     span = np.minimum(high, math.pi) - np.maximum(low, -math.pi)
     room = np.minimum(q - np.maximum(low, -math.pi), np.minimum(high, math.pi) - q) / np.where(span > 0, span, 1.0)
     least = math.inf

@@ -25,15 +25,18 @@ from numpy.typing import NDArray
 from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import DATA, HOME, WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs, resolve
+from apex_ompl.robot.joint_order import name_back, names_in_order
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import counted, html_table, one_line
 from apex_ompl.util.schema import StrictModel
 from apex_ompl.util.validation import number_array, shape_error
 
 SHORTEST_RAMP = 1e-6  # from no acceleration to the largest, for motions whose knots have distinct times [s]
 LIMIT_SLACK = 1e-3  # by which a joint of a start or a goal may be outside its limits [rad; synergies 0..1]
+TURN = 2.0 * np.pi  # of a continuous joint [rad]
+SPEED = 2.0  # of turning joints, for weights of a robot without any [rad/s]
 FILE_NAME = re.compile(r'filename="([^"]*)"')
 PIECE = 2**17  # of a file that is read at once [bytes]
 
@@ -117,6 +120,9 @@ class Robot:
         model: Pinocchio model; the order of its q differs from that of states, see :meth:`to_pinocchio`.
         geometry: Collision geometry of the links with the self-collision pairs, without a scene.
         fixtures: Solids that are fixed beside the robot, such as its tables.
+        weights: What a unit of each joint counts in distances between states and lengths of paths, shape (dof,): 1 of
+            turning joints; see :func:`weights_of` [rad/rad, rad/m].
+        continuous: Which joints turn without end, shape (dof,): states that differ by whole turns of them are alike.
         part_links: Part name -> names of its links.
         urdf: The composed URDF with absolute mesh paths.
         covers: File of the links' sphere covers, or None.
@@ -134,6 +140,8 @@ class Robot:
     model: pin.Model
     geometry: pin.GeometryModel
     fixtures: tuple[Body, ...]
+    weights: Array
+    continuous: Flags
     part_links: Mapping[str, tuple[str, ...]]
     urdf: str
     covers: Path | None
@@ -269,13 +277,46 @@ class Robot:
         Encoders and controllers are off by some tenths of a milliradian, and rounded limits by less; joints that are
         further out are left as they are.
         """
-        inside = np.clip(states, self.limits.lower, self.limits.upper)
-        return np.where(np.abs(inside - states) <= LIMIT_SLACK, inside, states)
+        return _nearly_inside(self.limits, states)
+
+    def range_around(self, q: Array | float = 0.0, turns: float = 0.5) -> tuple[Array, Array]:
+        """Return the limits, of continuous joints so many turns to either side of ``q`` and inside their limits.
+
+        Args:
+            q: A state, shape (dof,).
+            turns: Turns to either side.
+
+        Returns:
+            Lowest and highest values, shape (dof,) each.
+        """
+        low, high, half = self.limits.lower, self.limits.upper, TURN * turns
+        return (
+            np.where(self.continuous, np.maximum(low, q - half), low),
+            np.where(self.continuous, np.minimum(high, q + half), high),
+        )
 
     def random_state(self, rng: np.random.Generator, size: int | None = None) -> Array:
-        """Return states drawn uniformly inside the limits, shape (dof,) or (size, dof)."""
+        """Return states drawn uniformly inside the limits, continuous joints within a turn; (dof,) or (size, dof)."""
         shape = (self.dof,) if size is None else (size, self.dof)
-        return rng.uniform(self.limits.lower, self.limits.upper, shape)
+        return rng.uniform(*self.range_around(), shape)
+
+    def turned_to(self, states: Array, q: Array) -> Array:
+        """Return states with continuous joints turned by whole turns, so that they are the nearest to ``q``.
+
+        Args:
+            states: Shape (..., dof).
+            q: Shape (dof,), or that of the states.
+        """
+        if not self.continuous.any():
+            return states
+        turns = np.where(self.continuous, np.rint((q - states) / TURN), 0.0)
+        return np.asarray(np.where(turns == 0.0, states, states + TURN * turns))
+
+
+def _nearly_inside(limits: Limits, states: Array) -> Array:
+    """Return states, shape (..., dof), with joints at most LIMIT_SLACK outside their limits moved to them."""
+    inside = np.clip(states, limits.lower, limits.upper)
+    return np.where(np.abs(inside - states) <= LIMIT_SLACK, inside, states)
 
 
 def robot_names() -> tuple[str, ...]:
@@ -343,12 +384,15 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         MissingFileError: A URDF, an SRDF or a collision mesh is missing.
         RobotError: The description cannot be made into a robot.
     """
+    config = config.with_bases()
     both = next((name for name in config.locked if name in config.joints), None)
     if both is not None:
         raise FileFormatError(str(path), "locked", both, "expected joints that are not planned (joints)")
     composition = compose(config, path.parent)
     try:
-        model = pin.buildModelFromXML(composition.urdf, mimic=True)
+        urdf, old = names_in_order(composition.urdf)
+        model = pin.buildModelFromXML(urdf, mimic=True)
+        name_back(model, old)
         geometry = pin.buildGeomFromUrdfString(model, composition.urdf, pin.GeometryType.COLLISION)
     except Exception as error:  # Pinocchio's parser raises several kinds
         raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error
@@ -369,19 +413,23 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     groups = {g: np.array([names.index(n) for n in members]) for g, members in config.groups.items()}
     limits = _limits(config, model, path)
     effort = np.array([joint.effort for joint in config.joints.values()])
-    home = np.array([joint.home for joint in config.joints.values()])
+    home = _nearly_inside(limits, np.array([joint.home for joint in config.joints.values()]))
     outside = ~((home >= limits.lower) & (home <= limits.upper))
     if outside.any():
         name = names[int(np.argmax(outside))]
         field_name, value = f"joints.{name}.home", config.joints[name].home
         raise FileFormatError(str(path), field_name, value, "expected a value inside the limits")
     poses = {HOME: home, **{pose: _posed(config, limits, pose, path) for pose in config.poses}}
-    for array in (effort, *poses.values(), *vars(limits).values(), *groups.values(), order):
+    turning = np.array(["P" not in model.joints[model.getJointId(name)].shortname() for name in names])
+    continuous = turning & (limits.lower <= -WIDEST) & (limits.upper >= WIDEST)
+    weights = weights_of(limits, turning)
+    for array in (weights, continuous, effort, *poses.values(), *vars(limits).values(), *groups.values(), order):
         array.flags.writeable = False
     return Robot(
         name=config.name, joint_names=names, limits=limits, effort=effort, home=home, poses=poses, groups=groups,
-        hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures,
-        part_links=composition.part_links, urdf=composition.urdf, covers=covers, files=tuple(files), _order=order,
+        hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures, weights=weights,
+        continuous=continuous, part_links=composition.part_links, urdf=composition.urdf, covers=covers,
+        files=tuple(files), _order=order,
     )  # fmt: skip
 
 
@@ -392,7 +440,7 @@ def _posed(config: RobotConfig, limits: Limits, pose: str, path: Path) -> Array:
         FileFormatError: A value is outside the limits.
     """
     values = config.poses[pose]
-    q = np.array([values.get(name, joint.home) for name, joint in config.joints.items()])
+    q = _nearly_inside(limits, np.array([values.get(name, joint.home) for name, joint in config.joints.items()]))
     for k, name in enumerate(config.joints):
         if not limits.lower[k] <= q[k] <= limits.upper[k]:
             raise FileFormatError(str(path), f"poses.{pose}.{name}", q[k], "expected a value inside the limits")
@@ -431,6 +479,22 @@ def _limits(config: RobotConfig, model: pin.Model, path: Path) -> Limits:
             raise FileFormatError(str(path), f"joints.{name}", [low, high], f"expected limits within {WIDEST:g}")
         rows.append((low, high, speed, joint.acceleration, joint.jerk))
     return Limits(*(np.array(column, float) for column in zip(*rows, strict=True)))
+
+
+def weights_of(limits: Limits, turning: Flags) -> Array:
+    """Return what a unit of each joint counts in distances between states, shape (dof,) [rad/rad, rad/m].
+
+    A radian of a turning joint counts 1. A meter of a prismatic joint of velocity v counts as many radians as turning
+    joints move meanwhile, w = median(v_turning) / v, 2 rad/s without any. So the distance is one of time. But its whole
+    range counts at most as a turn, or as a radian for each meter: slow joints would hold back all others in a search.
+
+    Args:
+        limits: Limits of the joints.
+        turning: Which of them turn, shape (dof,).
+    """
+    speed = float(np.median(limits.velocity[turning])) if turning.any() else SPEED
+    most = np.maximum(TURN / (limits.upper - limits.lower), 1.0)
+    return np.where(turning, 1.0, np.minimum(speed / limits.velocity, most))
 
 
 _digests: WeakKeyDictionary[Robot, str] = WeakKeyDictionary()

@@ -201,6 +201,7 @@ class _Writer:
         self.packages = packages
         self.notes: list[str] = []
         self.comments: dict[str, str] = {}  # of joints, hands and groups
+        self.carriers: dict[str, dict[str, float]] = {}  # locked joints that carry arms
         self.states: dict[str, float] = {}  # of the SRDFs
         self.texts: dict[Path, str] = {}
         self.data: dict[str, Any] = {
@@ -268,6 +269,11 @@ class _Writer:
         self.states |= {prefix + joint: state[joint] for joint in planned if joint in state}
         locked = guesses.locked_values(robot, planned, state)
         self.data["locked"] |= {prefix + joint: value for joint, value in locked.items()}
+        for joint in guesses.carriers(robot, part.arms):
+            self.carriers[prefix + joint] = {"home": locked[joint]} | guesses.joint_record(robot.joints[joint])[0]
+            self.notes.append(f"{prefix}{joint} carries arms and is locked; a commented line in the file plans it")
+        if guesses.drives(robot):
+            self.notes.append(f"{part.name} stands still; planar: {{x: [-2, 2], y: [-2, 2]}} in its part lets it drive")
 
     def _add_arm(self, part: _Part, arm: guesses.Arm) -> None:
         group, hand = part.prefix + arm.group, part.prefix + arm.hand
@@ -347,6 +353,10 @@ class _Writer:
             f"# Home: {_on_one_line(self.comments['home'])}.", "joints:",
         ]  # fmt: skip
         lines += [self._line("joints", name, record, " (guessed)") for name, record in data["joints"].items()]
+        lines += [
+            f"  # {_flow(name)}: {_flow(record)}  # carries arms; to plan it, delete it from locked"
+            for name, record in self.carriers.items()
+        ]
         if data["locked"]:
             lines += [
                 "# Joints that are not planned for; those that mimic them are locked with them. (guessed)",

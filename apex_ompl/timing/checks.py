@@ -59,7 +59,7 @@ def check_plan(
     for name, states in (("path", path), *((("trajectory", motion.positions),) if motion is not None else ())):
         _check_end(name, states[0], starts, "start", START_TOLERANCE)
         if status != APPROXIMATE and len(goals):
-            within = goals if known is None else known.within_limits(goals)
+            within = goals if known is None else known.turned_to(known.within_limits(goals), states[-1])
             wanted = np.where(goals == starts, states[0], within)  # joints at rest keep their clipped values
             _check_end(name, states[-1], wanted, "goal", START_TOLERANCE if known is None else SAME_STATE)
     if known is not None:

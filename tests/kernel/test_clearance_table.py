@@ -32,10 +32,13 @@ def random_table(rng: np.random.Generator, axes: int) -> ClearanceTable:
     return ClearanceTable(joints, lower, upper, np.maximum(cells, rng.integers(0, 60)).astype(np.uint8))
 
 
-def bounds(tables: list[ClearanceTable | None], k: int, states: np.ndarray, half: np.ndarray) -> np.ndarray:
+def bounds(
+    tables: list[ClearanceTable | None], k: int, states: np.ndarray, half: np.ndarray, continuous: tuple[int, ...] = ()
+) -> np.ndarray:
     """Bounds of the kernel for pair ``k`` at states and over boxes, shape (N, 2), in units of the tables."""
     names = [f"q{n}" for n in range(DOF)]
     arrays = random_robot(0, dof=DOF)[0].arrays._replace(**table_arrays(tables, names))
+    arrays.continuous[list(continuous)] = 1
     cells, boxes = np.empty(len(states)), np.empty(len(states))
     look_up(*pack(arrays), k, states, half, cells, boxes)
     return np.rint(np.stack([cells, boxes], axis=1) / UNIT).astype(int)
@@ -68,6 +71,48 @@ def test_a_box_gets_no_more_than_the_least_of_its_cells(axes: int) -> None:
             exact += 1
     assert inside > 100
     assert exact > 50
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_cells_of_continuous_joints_repeat_after_a_turn(axes: int) -> None:
+    rng = np.random.default_rng(axes)
+    table, n, turn = random_table(rng, axes), SIZES[axes], 2.0 * np.pi
+    joints = [int(name[1:]) for name in table.joints]
+    table.lower[0], table.upper[0] = -np.pi, np.pi
+    width = (table.upper - table.lower) / n
+    states = rng.uniform(-2.0, 2.0, (400, DOF))
+    states[:, joints[0]] = rng.uniform(-300.0, 300.0, 400)
+    half = rng.uniform(0.0, 0.3, (400, DOF)) * rng.choice([0.0, 0.2, 1.0], (400, 1))
+    half[::7, joints[0]] = rng.uniform(3.0, 30.0, len(half[::7]))
+    half[3, joints[0]], states[5, joints[0]] = np.inf, np.nan
+    found = bounds([table], 0, states, half, (joints[0],))
+    assert found[3, 1] == 0
+    assert not found[5].any()
+    inside = exact = 0
+    for k in (k for k in range(400) if k not in (3, 5)):
+        q, h, (cell, box) = states[k, joints], half[k, joints], found[k]
+        low, at, high = (np.floor((x - table.lower) / width).astype(int) for x in (q - h, q, q + h))
+        if (at[1:] < 0).any() or (at[1:] >= n).any():
+            assert cell == 0
+            continue
+        assert cell == table.cells[tuple(np.append(at[0] % n, at[1:]))]
+        if (low[1:] < 0).any() or (high[1:] >= n).any():
+            assert box == 0
+            continue
+        rows = np.arange(low[0], high[0] + 1) % n
+        least = table.cells[np.ix_(rows, *(np.arange(a, b + 1) for a, b in zip(low[1:], high[1:], strict=True)))].min()
+        assert box <= least
+        inside += 1
+        if (high - low < ACROSS).all():
+            assert box == least
+            exact += 1
+    assert inside > 100
+    assert exact > 30
+    again = states.copy()
+    again[:, joints[0]] += turn * rng.integers(-9, 10, 400)
+    at = (states[:, joints[0]] + np.pi) / width[0] % 1.0
+    clear = (at > 1e-6) & (at < 1.0 - 1e-6)  # of borders of cells, in spite of rounding
+    assert np.array_equal(bounds([table], 0, again, np.zeros_like(half), (joints[0],))[clear, 0], found[clear, 0])
 
 
 def test_what_is_no_number_is_not_proved() -> None:

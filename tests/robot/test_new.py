@@ -97,9 +97,11 @@ def test_missing_limits_are_assumed_with_a_comment(tmp_path: Path) -> None:
     edits = {'type="revolute"': 'type="continuous"', '<axis xyz="0 1 0"/>' + LIMIT: '<axis xyz="0 1 0"/>'}
     made = new_robot(sources_of([str(write_toy(tmp_path, edits))]), tmp_path / "toy.robot.yaml")
     robot = load_robot(made.file)
-    assert np.allclose(robot.limits.upper, [2 * np.pi, np.pi, 2.0, 2.0], atol=1e-5)
+    assert np.allclose(robot.limits.upper, [1e4, np.pi, 2.0, 2.0], atol=1e-5)
+    assert list(robot.continuous) == [True, False, False, False] and abs(robot.home[0]) <= np.pi
     lines = {line.split(":")[0].strip(): line for line in made.file.read_text().splitlines()}
-    assert "# continuous, planned from -2 pi to 2 pi (guessed)" in lines["joint1"]
+    assert "velocity: 2," in lines["joint1"] and "upper:" not in lines["joint1"].split("#")[0]
+    assert "# turns without end; give lower and upper if" in lines["joint1"]
     assert "# no range in the URDF, assumed; no velocity in the URDF, assumed (guessed)" in lines["joint2"]
     assert "#" not in lines["joint3"]
 
@@ -160,6 +162,19 @@ def test_a_mobile_base_stands_still(tmp_path: Path) -> None:
     base += "</robot>"
     made = new_robot(sources_of([str(write_toy(tmp_path, {"</robot>": base}))]), tmp_path / "toy.robot.yaml")
     assert "  drive: 0\n" in made.file.read_text() and load_robot(made.file).dof == 4
+    assert any("toy stands still; planar: {x: " in note for note in made.notes)
+
+
+def test_a_joint_that_carries_arms_is_a_commented_line_that_plans_it(tmp_path: Path) -> None:
+    lift = '<link name="rail"/><joint name="lift" type="prismatic"><parent link="rail"/><child link="stand"/>'
+    lift += '<axis xyz="0 0 1"/><limit lower="0.1" upper="0.4" velocity="0.05" effort="1"/></joint></robot>'
+    urdf = str(write_toy(tmp_path, {"</robot>": lift}))
+    made = new_robot(sources_of([urdf], [str(tmp_path / "toy.srdf")]), tmp_path / "toy.robot.yaml")
+    text = made.file.read_text()
+    assert "lift" not in load_robot(made.file).joint_names and any("lift carries arms" in one for one in made.notes)
+    made.file.write_text(text.replace("  # lift: {", "  lift: {").replace("  lift: 0.1\n", ""))
+    robot = load_robot(made.file)
+    assert robot.joint_names[-1] == "lift" and robot.home[-1] == 0.1 and robot.weights[-1] > 1.0
 
 
 def test_packages_are_found_above_the_urdf_beside_it_and_by_name(tmp_path: Path) -> None:

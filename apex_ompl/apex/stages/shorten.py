@@ -64,22 +64,22 @@ class Shorten:
         with context.report.timed("simplify"):
             found = self._cut_short(context, path.states)
             for states in found:
-                short = Path(states)
+                short = context.weighed(Path(states))
                 if short.length < path.length and context.is_valid(states) and context.accept_if_shorter(short):
                     return context.fit(states)
         return context.fit(found[0])
 
     def _cut_short(self, context: SolveContext, states: Array) -> list[Array]:
         """Return a polyline after shortcuts, and others where it takes a detour; the shortest first."""
-        found = [_shortcut(context, states)]
+        found, weights = [_shortcut(context, states)], context.kernel.robot.arrays.weight
         if self.tree_range is None:
             return found
         for _ in range(OTHERS):
-            if context.stop() or path_length(found[0]) <= DETOUR * path_length(states[[0, -1]]):
+            if context.stop() or path_length(found[0], weights) <= DETOUR * path_length(states[[0, -1]], weights):
                 break
             other = _another(context, states, self.tree_range)
             found += [] if other is None else [_shortcut(context, other)]
-            found.sort(key=path_length)
+            found.sort(key=lambda path: path_length(path, weights))
         return found
 
     @staticmethod

@@ -201,7 +201,8 @@ def apart_over(robot: Robot, pair: Pair) -> str:
     item = robot.geometry.geometryObjects[pair[joints.index(moved)]]
     reach = 1.0 if "P" in model.joints[moved].shortname() else _reach(item)
     alone = SelfCollision(robot, [pair])
-    intervals = [(float(robot.limits.lower[k]), float(robot.limits.upper[k]))]
+    lower, upper = robot.range_around()
+    intervals = [(float(lower[k]), float(upper[k]))]
     for low, high in intervals:
         q = robot.home.copy()
         q[k] = 0.5 * (low + high)

@@ -122,5 +122,6 @@ def open_meshes(robot: Robot) -> tuple[str, ...]:
 
 def unlimited_joints(robot: Robot) -> tuple[str, ...]:
     """Return the joints whose range is so wide that it is none."""
-    span = robot.limits.upper - robot.limits.lower
+    low, high = robot.range_around()
+    span = high - low
     return tuple(name for name, width in zip(robot.joint_names, span, strict=True) if width > WIDE)

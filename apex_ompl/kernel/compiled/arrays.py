@@ -34,6 +34,9 @@ class RobotArrays(NamedTuple):
     are placed at every state, ``lazy`` ones, which are inner joints of clusters, only where balls around cluster and
     part are not enough.
 
+    ``weight`` is what a unit of each planned joint counts in distances between states [rad/rad, rad/m]; ``continuous``
+    is 1 for those after a whole turn of which the robot is as it was.
+
     ``cluster_ball`` holds center and radius of a ball around all of a cluster's solids in the frame of
     ``cluster_joint``, for all values of its inner joints; ``cluster_outer`` is the radius around its leaf spheres,
     ``cluster_spread`` the largest distance of a sphere's center from the ball's, ``cluster_speed`` the largest speed
@@ -57,7 +60,8 @@ class RobotArrays(NamedTuple):
     ``bodies_table`` is the clearance table of each of ``bodies``, or -1, see
     :mod:`apex_ompl.kernel.compiled.check.clearance_table`. ``table_joints`` are the one to three planned joints that it
     depends on (else -1), ``table_cells`` its first byte and number of cells along each axis, ``table_range`` for each
-    joint the lowest value and cells per unit, ``table_bytes`` eight bytes in each number.
+    joint the lowest value and cells per unit (a whole turn of a continuous one), ``table_bytes`` eight bytes in each
+    number.
     """
 
     joint_parent: Integers
@@ -87,6 +91,8 @@ class RobotArrays(NamedTuple):
     joint_shift: Floats
     lower: Floats
     upper: Floats
+    weight: Floats
+    continuous: Integers
     cluster_ball: Balls
     cluster_outer: Floats
     part_ball: Annotated[Floats, BINS, 4]

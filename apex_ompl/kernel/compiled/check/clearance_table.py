@@ -3,10 +3,13 @@
 A table is a grid of cells over the values of these joints, 2^L along each axis. Each cell holds a lower bound of the
 distance for all values in it, in units of UNIT, as one byte; 0 where the bodies are not proved apart. Coarser grids
 follow, each with half as many cells along each axis, whose cells hold the least value of those that they consist of.
-A box of joint values is looked up in the finest grid of which it meets at most ACROSS cells along each axis.
+A box of joint values is looked up in the finest grid of which it meets at most ACROSS cells along each axis. The cells
+of a continuous joint are those of a whole turn, which repeat.
 """
 
 from __future__ import annotations
+
+import math
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays
 from apex_ompl.kernel.compiled.compilation import inlined, outlined
@@ -15,6 +18,7 @@ from apex_ompl.kernel.compiled.layout import Floats
 UNIT = 1e-4  # of the bounds [m]
 LARGEST = 255  # bound in these units
 ACROSS = 4  # most cells along an axis that are read
+MOST_CELLS = 1e9  # from the first one, of a continuous joint
 
 
 @inlined
@@ -39,18 +43,49 @@ def _width(t: RobotArrays, e: int, axis: int, half_width: Floats) -> float:
     return width
 
 
+@inlined
+def _endless(t: RobotArrays, e: int, axis: int) -> bool:
+    """Whether an axis of table ``e`` is a continuous joint, so that its cells repeat."""
+    joint, endless = t.table_joints[e, axis], False
+    if joint >= 0:
+        endless = t.continuous[joint] != 0
+    return endless
+
+
+@inlined
+def _cells(t: RobotArrays, e: int, axis: int, q: Floats, half_width: Floats) -> tuple[int, int, bool]:
+    """Return the first and last cell that a box meets along an axis of table ``e``, and whether the table has it.
+
+    Cells of a continuous joint may be below 0 or beyond the last, for cell + n; they are all where it turns so far.
+    """
+    n, width = t.table_cells[e, 1], _width(t, e, axis, half_width)
+    low, high = _cell(t, e, axis, q, -width), _cell(t, e, axis, q, width)
+    if not _endless(t, e, axis):
+        if 0.0 <= low <= high < n:  # NaN is in no cell
+            return int(low), int(high), True
+        return 0, 0, False
+    if not -MOST_CELLS <= low <= high <= MOST_CELLS:
+        return 0, 0, False
+    first, last = int(math.floor(low)), int(math.floor(high))
+    if last - first >= n:
+        first, last = 0, n - 1
+    return first, last, True
+
+
 @outlined
 def clearance_of_cell(t: RobotArrays, k: int, q: Floats) -> float:
     """Return a lower bound of the distance of the bodies of pair ``k``, which has a table, at a state [m]."""
     e = t.bodies_table[k]
-    x, y, z, n = _cell(t, e, 0, q, 0.0), _cell(t, e, 1, q, 0.0), _cell(t, e, 2, q, 0.0), t.table_cells[e, 1]
-    if not (0.0 <= x < n and 0.0 <= y < n and 0.0 <= z < n):  # NaN is in no cell
-        return 0.0
-    place = int(x)
-    if t.table_joints[e, 1] >= 0:
-        place = place * n + int(y)
-    if t.table_joints[e, 2] >= 0:
-        place = place * n + int(z)
+    n, place = t.table_cells[e, 1], 0
+    for axis in range(3):
+        if t.table_joints[e, axis] < 0:
+            break
+        at = _cell(t, e, axis, q, 0.0)
+        if _endless(t, e, axis) and -MOST_CELLS <= at <= MOST_CELLS:
+            at = float(int(math.floor(at)) & (n - 1))
+        if not 0.0 <= at < n:  # NaN is in no cell
+            return 0.0
+        place = place * n + int(at)
     return UNIT * _value(t, t.table_cells[e, 0] + place)
 
 
@@ -66,13 +101,11 @@ def clearance_of_box(t: RobotArrays, k: int, q: Floats, half_width: Floats) -> f
     """
     e = t.bodies_table[k]
     n, first = t.table_cells[e, 1], t.table_cells[e, 0]
-    x, y, z = _width(t, e, 0, half_width), _width(t, e, 1, half_width), _width(t, e, 2, half_width)
-    x, u = _cell(t, e, 0, q, -x), _cell(t, e, 0, q, x)
-    y, v = _cell(t, e, 1, q, -y), _cell(t, e, 1, q, y)
-    z, w = _cell(t, e, 2, q, -z), _cell(t, e, 2, q, z)
-    if not (0.0 <= x <= u < n and 0.0 <= y <= v < n and 0.0 <= z <= w < n):
+    a, b, x = _cells(t, e, 0, q, half_width)
+    c, d, y = _cells(t, e, 1, q, half_width)
+    f, g, z = _cells(t, e, 2, q, half_width)
+    if not (x and y and z):
         return 0.0
-    a, b, c, d, f, g = int(x), int(u), int(y), int(v), int(z), int(w)
     rows = n if t.table_joints[e, 1] >= 0 else 1
     columns = n if t.table_joints[e, 2] >= 0 else 1
     while b - a >= ACROSS or d - c >= ACROSS or g - f >= ACROSS:
@@ -82,7 +115,7 @@ def clearance_of_box(t: RobotArrays, k: int, q: Floats, half_width: Floats) -> f
     least = LARGEST
     for i in range(a, b + 1):
         for j in range(c, d + 1):
-            place = first + (i * rows + j) * columns
+            place = first + ((i & (n - 1)) * rows + (j & (rows - 1))) * columns
             for m in range(f, g + 1):
-                least = min(least, _value(t, place + m))
+                least = min(least, _value(t, place + (m & (columns - 1))))
     return UNIT * least

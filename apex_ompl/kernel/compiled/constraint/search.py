@@ -139,7 +139,7 @@ def _extend(
     exact: bool, b: RowBuffers, p: ProofBuffers,
 ) -> tuple[int, int]:  # fmt: skip
     """Let a tree go for the target from its nearest node; return that and its last node, -1 where there is no room."""
-    root = nearest(trees.states[tree], trees.sizes[tree], e.target, trees.squares)
+    root = nearest(trees.states[tree], trees.sizes[tree], e.target, t.weight, trees.squares)
     near, dof = root, len(e.target)
     for i in range(dof):
         e.begin[i] = trees.states[tree, i, near]

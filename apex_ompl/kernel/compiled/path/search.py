@@ -24,15 +24,15 @@ from apex_ompl.kernel.compiled.workspace import workspace_view
 
 
 @inlined
-def nearest(states: Floats, count: int, q: Floats, squares: Floats) -> int:
+def nearest(states: Floats, count: int, q: Floats, weight: Floats, squares: Floats) -> int:
     """Return the node of a tree that is nearest to a state; ``states`` are columns, shape (dof, M)."""
     room = squares[:count]
     for n in range(len(room)):
         room[n] = 0.0
     for i in range(len(q)):
-        row, value = states[i, :count], q[i]
+        row, value, factor = states[i, :count], q[i], weight[i]
         for n in range(len(row)):
-            apart = row[n] - value
+            apart = (row[n] - value) * factor
             room[n] += apart * apart
     best = 0
     for n in range(len(room)):
@@ -59,7 +59,7 @@ def grow_trees(
         wi: Workspace, see :func:`apex_ompl.kernel.compiled.workspace.workspace_sizes`.
         wf: Workspace.
         samples: Random states, shape (N, dof).
-        longest: Longest step [rad].
+        longest: Longest step, of joints weighed as in distances [rad].
         resolution: Largest spacing of the states that are checked [rad, max-norm].
         states: Nodes of the trees as columns, shape (2, dof, M).
         parents: Their parents, -1 for roots, shape (2, M).
@@ -92,11 +92,11 @@ def grow_trees(
             if sizes[tree] == room:
                 return k
             if near < 0:
-                near = nearest(states[tree], sizes[tree], target, squares)
+                near = nearest(states[tree], sizes[tree], target, t.weight, squares)
             square = 0.0
             for i in range(dof):
                 motion[0, i] = states[tree, i, near]
-                square += (target[i] - motion[0, i]) ** 2
+                square += ((target[i] - motion[0, i]) * t.weight[i]) ** 2
             share = 1.0 if square <= longest * longest else longest / math.sqrt(square)
             for i in range(dof):
                 motion[1, i] = target[i] if share == 1.0 else motion[0, i] + share * (target[i] - motion[0, i])

@@ -14,11 +14,11 @@ LEAST_GAIN = 1e-6  # by which a shortcut must be shorter [rad]
 
 
 @inlined
-def _apart(path: Floats, i: int, j: int) -> float:
+def _apart(path: Floats, i: int, j: int, weight: Floats) -> float:
     """Return the distance of two states [rad]."""
     square = 0.0
     for d in range(path.shape[1]):
-        square += (path[j, d] - path[i, d]) ** 2
+        square += ((path[j, d] - path[i, d]) * weight[d]) ** 2
     return float(math.sqrt(square))
 
 
@@ -52,10 +52,10 @@ def _leave_out(
 
 
 @inlined
-def _point_at(path: Floats, count: int, along: float, out: Floats) -> int:
+def _point_at(path: Floats, count: int, along: float, weight: Floats, out: Floats) -> int:
     """Put the state at a length along a path into place [rad]; return the number of the state before it."""
     for i in range(count - 1):
-        length = _apart(path, i, i + 1)
+        length = _apart(path, i, i + 1, weight)
         if along <= length or i == count - 2:
             share = min(along / length, 1.0) if length > 0.0 else 0.0
             for d in range(path.shape[1]):
@@ -77,11 +77,12 @@ def _cut(
             break
         total = 0.0
         for i in range(count - 1):
-            total += _apart(path, i, i + 1)
+            total += _apart(path, i, i + 1, t.weight)
         low, high = min(draws[n, 0], draws[n, 1]) * total, max(draws[n, 0], draws[n, 1]) * total
-        i, j = _point_at(path, count, low, motion[0]), _point_at(path, count, high, motion[1])
+        i = _point_at(path, count, low, t.weight, motion[0])
+        j = _point_at(path, count, high, t.weight, motion[1])
         size = i + 3 + count - 1 - j
-        if i == j or size > len(path) or _apart(motion, 0, 1) > high - low - LEAST_GAIN:
+        if i == j or size > len(path) or _apart(motion, 0, 1, t.weight) > high - low - LEAST_GAIN:
             continue
         if not is_motion_proved(t, s, w, motion, resolution, starts, queue, ends, state, found, counts):
             continue
