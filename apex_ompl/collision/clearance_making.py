@@ -27,16 +27,13 @@ from apex_ompl.collision.clearance_tables import (
     table_range,
     write_clearances,
 )
-from apex_ompl.collision.cover.quick import covers_of
 from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays
-from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.tables import joint_tree, tabulate
+from apex_ompl.collision.links import Links
+from apex_ompl.collision.tables import joint_tree
 from apex_ompl.kernel.arrays import pack
 from apex_ompl.kernel.box_bound import BoxBounds
 from apex_ompl.kernel.clearance_table import LARGEST, UNIT
-from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.products import product
-from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, is_file
@@ -92,20 +89,16 @@ class TableMaker:
             FileFormatError: That file does not follow its schema.
             RobotError: The kernel does not support the motion of a joint.
         """
-        stage, tree = MeshStage(robot), joint_tree(robot)
-        self._robot, self._solids = robot, [stage.solids[k] for k in range(stage.links)]
-        tables = tabulate(
-            robot, solids=self._solids, numbers=range(stage.links), pairs=stage.body_pairs,
-            covers=covers_of(robot, [solid.shape for solid in self._solids]), meets_scene=[False] * stage.links,
-        )  # fmt: skip
-        self._kernel = Kernel(tables, scene_tables([]))
-        self._row = {number: row for row, number in enumerate(tables.numbers)}
-        bodies = [self._solids[number] for number in tables.numbers]
+        links, tree = Links.of(robot), joint_tree(robot)
+        self._robot, self._solids = robot, links.solids
+        numbers = links.kernel.robot.numbers
+        self._row = {number: row for row, number in enumerate(numbers)}
+        bodies = [self._solids[number] for number in numbers]
         arrays = shape_arrays(
             [PlacedShape(s.shape, s.joint, product(tree.turns[s.joint].T, s.placement.homogeneous)) for s in bodies]
         )
-        self._radii, self._bounds = arrays.ball[:, 3], BoxBounds(self._kernel, pack(arrays))
-        near, shares = near_pairs(robot, tree, self._solids, stage.body_pairs), self._open_shares()
+        self._radii, self._bounds = arrays.ball[:, 3], BoxBounds(links.kernel, pack(arrays))
+        near, shares = near_pairs(robot, tree, self._solids, links.pairs), _open_shares(robot, links)
         self.pairs = sorted(
             (p for p in near if p.links in shares), key=lambda p: (len(p.sources) // 3, -shares[p.links], p.links)
         )
@@ -115,14 +108,6 @@ class TableMaker:
         """Return the names of a pair's links."""
         first, second = (self._solids[k] for k in pair.links)
         return first.part or first.name, second.part or second.name
-
-    def _open_shares(self) -> dict[tuple[int, int], float]:
-        """Return for pairs of links the share of random states at which the covers leave them open."""
-        states, numbers = self._robot.random_state(np.random.default_rng(0), SAMPLES), self._kernel.robot.numbers
-        left, counts = self._kernel.unproved(states, most=len(self._kernel.robot.arrays.bodies) + 1)
-        found = np.concatenate([rows[: max(count, 0)] for rows, count in zip(left, counts, strict=True)])
-        counted = Counter((min(pair), max(pair)) for pair in ((numbers[a], numbers[b]) for a, b in found.tolist()))
-        return {pair: count / SAMPLES for pair, count in counted.items()}
 
     def bounds(self, pair: NearPair, middles: Array, half: Array, *, least: float, need: float) -> Array:
         """Return :meth:`apex_ompl.kernel.box_bound.BoxBounds.over` of two links, the smaller of which moves."""
@@ -182,6 +167,13 @@ class TableMaker:
                 table, took = table_of(self._robot, pair, cells), time.process_time() - began
                 progress(TableReport(self.names(pair), table.joints, share, table.proved, len(cells), took, complete))
         return found
+
+
+def _open_shares(robot: Robot, links: Links) -> dict[tuple[int, int], float]:
+    """Return for pairs of links the share of random states at which the covers leave them open."""
+    states = robot.random_state(np.random.default_rng(0), SAMPLES)
+    counted = Counter(pair for some in links.open_pairs(states) for pair in (links.pairs if some is None else some))
+    return {pair: count / SAMPLES for pair, count in counted.items()}
 
 
 def _doubled(array: NDArray[Any]) -> NDArray[Any]:

@@ -11,14 +11,7 @@ from apex_ompl.util.files import write_atomically
 
 PACKAGE = "package://example-robot-data/robots"
 PLANAR = "planar.urdf"
-GROUP = """<robot name="planar">
-<group name="arm"><chain base_link="base" tip_link="link3"/></group>
-<disable_collisions link1="base" link2="link1" reason="Adjacent"/>
-<disable_collisions link1="link1" link2="link2" reason="Adjacent"/>
-<disable_collisions link1="link2" link2="link3" reason="Adjacent"/>
-</robot>
-"""
-SIZES = (0.5, 0.4, 0.3)  # lengths of the planar arm's links [m]
+SIZES = (0.4, 0.3, 0.25, 0.2)  # lengths of the planar arm's links [m]
 
 Place = tuple[float, float, float, float]
 
@@ -59,7 +52,7 @@ CELLS = {
 
 
 def planar_arm() -> str:
-    """Return the URDF of a planar arm of three revolute joints."""
+    """Return the URDF of a planar arm of four revolute joints."""
     parts = ['<robot name="planar"><link name="base"><collision><geometry>'
              '<cylinder radius="0.08" length="0.1"/></geometry></collision></link>']  # fmt: skip
     above, origin = "base", "0 0 0.1"
@@ -83,8 +76,7 @@ def robot_file(name: str, folder: Path) -> Path:
     file.parent.mkdir(parents=True, exist_ok=True)
     urdf, srdfs = f"{PACKAGE}/{cell.urdf}", [f"{PACKAGE}/{cell.srdf}"] if cell.srdf else []
     if cell.urdf == PLANAR:
-        urdf, srdfs = str(file.parent / PLANAR), [str(file.parent / "planar.srdf")]
+        urdf = str(file.parent / PLANAR)
         write_atomically(Path(urdf), planar_arm().encode())
-        write_atomically(Path(srdfs[0]), GROUP.encode())
     places = cell.places if len(cell.places) > 1 else ()
     return new_robot(sources_of([urdf] * len(cell.places), srdfs, places), file).file
