@@ -30,7 +30,7 @@ from apex_ompl.util.validation import check_integer, check_positive, check_seed
 Pair = tuple[int, int]
 
 FIRST = 500  # states at which all pairs are checked; those that touch at none remain
-CHUNK = 1000  # states between looks at the time
+CHUNK = 250  # states between looks at the time
 STARTS = 4  # closest states from which a local search starts, where the closest is ...
 FAR = 0.3  # ... nearer than this; else it starts from one [m]
 DISTANCES = 2000  # states at which distances are measured

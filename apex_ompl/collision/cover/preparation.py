@@ -1,8 +1,8 @@
 """What is computed once for a robot: pairs of links that need no check, and sphere covers of its links.
 
 Files are written beside the robot file as soon as there is something to write, and name how far they are, so that a
-preparation that was stopped goes on where it was. Covers are made quickly for all links first; they save most checks of
-meshes in the search for pairs, which comes next, then tables of the clearances of near links that the covers leave open.
+preparation that was stopped goes on where it was. Covers are made quickly for all links first, then tables of the
+clearances of near links that these leave open, and pairs are searched, for which the covers save most checks of meshes.
 Last, the covers of the links that still spoil most proofs are made anew, thoroughly, as long as the time lasts.
 """
 
@@ -34,7 +34,7 @@ from apex_ompl.util.files import check_writable, read_text, write_atomically
 from apex_ompl.util.validation import check_integer, check_positive
 
 SAMPLES = 500  # states at which it is measured which links spoil proofs
-QUICK_SHARE, PAIRS_SHARE = 0.4, 0.3  # of the budget, for quick covers at first, and for pairs
+QUICK_SHARE, PAIRS_SHARE = 0.5, 0.2  # of the budget, for quick covers at first, and for pairs
 TABLES_SHARE, MOST_FOR_TABLES = 0.5, 60.0  # of the time that is left then, for tables of near links, and most [s]
 COMMAND = "apex-ompl robot prepare"
 
@@ -107,16 +107,16 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
         check_writable(file)
     covers = _Covers(robot, covers_file, settings, report)
     covers.make(covers.all, 1, time.monotonic() + QUICK_SHARE * settings.budget)
-    links = None
-    if not covers.missing:
-        covered = config.model_copy(update={"disabled_pairs": None, "covers": str(covers_file)})
-        links = Links.of(build_robot(covered, path))
-    count, complete = _prepare_pairs(robot, config, pairs_file, settings, report, links)
-    _name_in(path, {"disabled_pairs": pairs_file})
-    files = [pairs_file]
+    files, links, known = [pairs_file], None, dict[str, str | None]()
     if covers_file.exists():
         _name_in(path, {"covers": covers_file})
-        files += [covers_file, *_prepare_tables(path, settings, deadline, report)]
+        known = {"covers": str(covers_file), "disabled_pairs": str(pairs_file) if pairs_file.exists() else None}
+        files += [covers_file, *_prepare_tables(build_robot(config.model_copy(update=known), path), deadline, report)]
+    if not covers.missing:
+        links = Links.of(build_robot(config.model_copy(update=known | {"disabled_pairs": None}), path))
+    count, complete = _prepare_pairs(robot, config, pairs_file, settings, report, links)
+    _name_in(path, {"disabled_pairs": pairs_file})
+    if covers_file.exists():
         if covers.missing:
             covers.make(covers.all, 1, deadline)
         if settings.effort > 1 and time.monotonic() < deadline:
@@ -127,7 +127,7 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
     return Prepared(count, numbers, covers.missing, thorough, tuple(files))
 
 
-def _prepare_tables(path: Path, settings: Preparation, deadline: float, report: Report) -> list[Path]:
+def _prepare_tables(robot: Robot, deadline: float, report: Report) -> list[Path]:
     """Write the tables of clearances of links that the covers leave open, and return their file."""
     stage, seconds = "near links", min(MOST_FOR_TABLES, TABLES_SHARE * (deadline - time.monotonic()))
     if seconds <= 0.0:
@@ -139,7 +139,7 @@ def _prepare_tables(path: Path, settings: Preparation, deadline: float, report: 
         spent += made.seconds
         report(stage, min(1.0, spent / seconds))
 
-    file = prepare_clearances(build_robot(read_config(path), path), seconds, progress)
+    file = prepare_clearances(robot, seconds, progress)
     report(stage, 1.0)
     return [] if file is None else [file]
 
