@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
-
 from apex_ompl.collision.cover.quick import covers_of
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid

@@ -38,6 +38,6 @@ def share_note(robot: Robot) -> str:
     if share >= ENOUGH:
         return ""
     return (
-        f"sphere covers prove only {share:.0%} of the free states of {robot.name}, so that trees checked by meshes come "
-        "first and planning is slow; `apex-ompl robot check` names the links, `apex-ompl robot prepare` makes covers"
+        f"sphere covers prove only {share:.0%} of the free states of {robot.name}, so that trees checked by meshes come"
+        " first and planning is slow; `apex-ompl robot check` names the links, `apex-ompl robot prepare` makes covers"
     )

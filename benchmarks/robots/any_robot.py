@@ -1,13 +1,13 @@
-"""Twelve robots from their URDFs: what is proved of their states, what preparing costs, and how fast they are planned for.
+"""Twelve robots from their URDFs: what is proved of their states, what that costs, and how fast they are planned for.
 
 Each robot is set up by ``apex-ompl robot new`` and prepared by ``apex-ompl robot prepare`` with default settings; a
 preparation that the time budget stopped goes on at the next call of this command. Shares are those of
 ``apex-ompl robot check``, on states that nothing was tuned on. Problems are random free starts and goals among boxes
-(:mod:`benchmarks.robots.boxes`). Apex has no model here: random perturbations take the place of proposals. Both planners
-have the same checker, problems, seeds and limit by the wall clock. Times are CPU times of whole calls of
+(:mod:`benchmarks.robots.boxes`). Apex has no model here: random perturbations take the place of proposals. Both
+planners have the same checker, problems, seeds and limit by the wall clock. Times are CPU times of whole calls of
 ``MotionPlanner.plan_problem`` without timing; ``in 1 s`` counts problems that were solved in 1 s of it, and percentiles
-are over all problems, those without a path last. Figures are kept in benchmarks/runs/robots, one file a robot; the
-command makes what is missing.
+are over all problems, those without a path last. Lengths are medians over the problems that both solved. Figures are
+kept in benchmarks/runs/robots, a file a robot; the command makes what is missing.
 
 Usage: python -m benchmarks.robots.any_robot [ROBOT...] [-n 100] [--budget 300] [--folder FOLDER]
 """

@@ -1,8 +1,8 @@
 """MotionBenchMaker's problems of the Panda, the UR5 and the Fetch: apex without a model beside rrtconnect+polish.
 
 The problems (Chamzas et al. 2022), URDFs, SRDFs and meshes are those of VAMP's repository, github.com/KavrakiLab/vamp,
-whose folder ``resources`` is given, its ``problems.tar.bz2`` unpacked. Robots are set up by ``apex-ompl robot new`` from
-them, the Fetch with its torso, locked joints as at the start of the first problem of a set, and prepared by
+whose folder ``resources`` is given, its ``problems.tar.bz2`` unpacked. Robots are set up by ``apex-ompl robot new``
+from them, the Fetch with its torso, locked joints as at the start of the first problem, and prepared by
 ``apex-ompl robot prepare``. Meshes decide. Problems whose start or goal the meshes refuse are left out and counted.
 Those of Baxter are in benchmarks/planners/motion_bench_maker.py. Times and columns are those of
 :mod:`benchmarks.robots.any_robot`; figures are kept in benchmarks/runs/mbm.

@@ -69,6 +69,7 @@ def disabled_pairs(
     search: PairSearch,
     deadline: float = np.inf,
     progress: Callable[[float], object] = lambda share: None,
+    *,
     links: Links | None = None,
 ) -> list[tuple[tuple[str, str], str]]:
     """Return the pairs of links to disable, sorted, with their reasons.
@@ -96,7 +97,7 @@ def disabled_pairs(
     inside = [pair for pair in pairs if (parts := _parts(robot, pair))[0] == parts[1] and parts[0] in search.soft]
     reasons = dict(zip(inside, _sweep(robot, inside), strict=True))
     rest = [pair for pair in pairs if pair not in reasons]
-    reasons |= _decide(robot, rest, search, deadline, progress, links)
+    reasons |= _decide(robot, rest, search, deadline, progress, links=links)
     return _by_links(robot, pairs, reasons)
 
 
@@ -160,7 +161,7 @@ class _Hits:
 
 def _decide(
     robot: Robot, pairs: list[Pair], search: PairSearch, deadline: float, progress: Callable[[float], object],
-    links: Links | None,
+    *, links: Links | None,
 ) -> dict[Pair, str]:  # fmt: skip
     """Return pair -> reason for the pairs that always or never touch."""
     rng = np.random.default_rng(search.seed)

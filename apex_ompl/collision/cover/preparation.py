@@ -114,7 +114,7 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
         files += [covers_file, *_prepare_tables(build_robot(config.model_copy(update=known), path), deadline, report)]
     if not covers.missing:
         links = Links.of(build_robot(config.model_copy(update=known | {"disabled_pairs": None}), path))
-    count, complete = _prepare_pairs(robot, config, pairs_file, settings, report, links)
+    count, complete = _prepare_pairs(robot, config, pairs_file, settings, report, links=links)
     _name_in(path, {"disabled_pairs": pairs_file})
     if covers_file.exists():
         if covers.missing:
@@ -145,7 +145,7 @@ def _prepare_tables(robot: Robot, deadline: float, report: Report) -> list[Path]
 
 
 def _prepare_pairs(
-    robot: Robot, config: RobotConfig, file: Path, settings: Preparation, report: Report, links: Links | None
+    robot: Robot, config: RobotConfig, file: Path, settings: Preparation, report: Report, *, links: Links | None
 ) -> tuple[int, bool]:
     """Write the file of disabled pairs unless it is this robot's; return the number, and whether all were decided."""
     search, deadline = settings.pairs, time.monotonic() + PAIRS_SHARE * settings.budget
@@ -154,7 +154,7 @@ def _prepare_pairs(
     known = read_disabled_pairs_file(file) if file.exists() else None
     if known is not None and known.command == command and known.robot == digest(robot):
         return len(known.pairs), True
-    found = disabled_pairs(robot, config, search, deadline, lambda share: report("pairs of links", share), links)
+    found = disabled_pairs(robot, config, search, deadline, lambda share: report("pairs of links", share), links=links)
     complete = time.monotonic() < deadline
     write_atomically(file, pairs_text(found, command if complete else f"{command}, stopped", digest(robot)).encode())
     return len(found), complete
