@@ -44,6 +44,8 @@ HOPELESS = 5  # level at which a table of which nothing is proved is given up
 SHARE = 1 / 3  # of the time that is left, for one table
 SAFE = 1e-6  # by which bounds are lowered [m]
 ENOUGH = 5e-4  # bound with which a cell is not divided further [m]
+NEAR = 2e-3  # bound that is tried first [m]
+FEW, MOSTLY = 16, 0.5  # cells, and share of them without a larger bound, from which larger bounds are given up
 SAMPLES = 500  # states at which the covers are tried
 AT_ONCE = 256  # cells between two readings of the clock
 
@@ -99,6 +101,7 @@ class TableMaker:
             [PlacedShape(s.shape, s.joint, product(tree.turns[s.joint].T, s.placement.homogeneous)) for s in bodies]
         )
         self._radii, self._bounds = arrays.ball[:, 3], BoxBounds(links.kernel, pack(arrays))
+        self._dense = set[tuple[int, int]]()  # pairs whose larger bounds take too many triangles
         near, shares = near_pairs(robot, tree, self._solids, links.pairs), _open_shares(robot, links)
         self.pairs = sorted(
             (p for p in near if p.links in shares), key=lambda p: (len(p.sources) // 3, -shares[p.links], p.links)
@@ -114,6 +117,21 @@ class TableMaker:
         """Return :meth:`apex_ompl.kernel.box_bound.BoxBounds.over` of two links, the smaller of which moves."""
         first, second = sorted((self._row[k] for k in pair.links), key=lambda row: self._radii[row])
         return self._bounds.over(first, second, middles, half, least=least, need=need)
+
+    def _bounds_over(self, pair: NearPair, middles: Array, half: Array, least: float) -> Array:
+        """Return lower bounds of the distance of two links over boxes; those below ``least`` are minus infinity [m].
+
+        The smaller the bound that suffices, the fewer triangles are examined: NEAR is tried first, and larger ones for
+        pairs of which those do not fail mostly.
+        """
+        found = self.bounds(pair, middles, half, least=least, need=NEAR + SAFE)
+        proved = np.flatnonzero(found >= least)
+        if pair.links not in self._dense and len(proved):
+            far = self.bounds(pair, middles[proved], half, least=least, need=(LARGEST + 1) * UNIT + SAFE)
+            found[proved] = np.maximum(found[proved], far)
+            if len(far) >= FEW and np.mean(np.isneginf(far)) > MOSTLY:
+                self._dense.add(pair.links)
+        return found
 
     def make(self, pair: NearPair, seconds: float) -> tuple[Cells, bool]:
         """Return the cells of a pair's table, and whether the CPU time sufficed [s]; cells are unproved where not."""
@@ -136,7 +154,7 @@ class TableMaker:
                     return cells, False
                 middles = np.repeat(middle[None], len(some), axis=0)
                 middles[:, axes] = lower + (some + 0.5) * width
-                bounds = self.bounds(pair, middles, half, least=enough + SAFE, need=(LARGEST + 1) * UNIT + SAFE)
+                bounds = self._bounds_over(pair, middles, half, enough + SAFE)
                 proved = bounds >= enough + SAFE
                 at = tuple(some[proved].T)
                 cells[at] = np.minimum((bounds[proved] - SAFE) / UNIT, LARGEST)
