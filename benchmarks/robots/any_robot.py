@@ -5,9 +5,10 @@ preparation that the time budget stopped goes on at the next call of this comman
 ``apex-ompl robot check``, on states that nothing was tuned on. Problems are random free starts and goals among boxes
 (:mod:`benchmarks.robots.boxes`). Apex has no model here: random perturbations take the place of proposals. Both
 planners have the same checker, problems, seeds and limit by the wall clock. Times are CPU times of whole calls of
-``MotionPlanner.plan_problem`` without timing; ``in 1 s`` counts problems that were solved in 1 s of it, and percentiles
-are over all problems, those without a path last. Lengths are medians over the problems that both solved. Figures are
-kept in benchmarks/runs/robots, a file a robot; the command makes what is missing.
+``MotionPlanner.plan_problem`` without timing. Problems that neither planner solves, some of which have no solution, are
+counted and left out. ``in 1 s`` is the share of the others that was solved in 1 s of CPU time, and percentiles are over
+all of them, those without a path last. Lengths are medians over the problems that both solved. Figures are kept in
+benchmarks/runs/robots, a file a robot; the command makes what is missing.
 
 Usage: python -m benchmarks.robots.any_robot [ROBOT...] [-n 100] [--budget 300] [--folder FOLDER]
 """

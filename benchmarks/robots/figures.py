@@ -94,11 +94,12 @@ class Figures:
         """Return the figures of the problems of some names, and a row of the table."""
         data = self.data
         figures = {key: data[key] for key in ("dof", "pairs", "free", "proved", "spoilers", "prepare_cpu_s")}
-        runs = [data["runs"][name] for name in names if name in data["runs"]]
+        all_runs = [data["runs"][name] for name in names if name in data["runs"]]
+        runs = [run for run in all_runs if any(one["solved"] for one in run.values())]
         both = [run for run in runs if all(one["solved"] for one in run.values())]
         cells: list[Any] = [label, data["dof"], data["pairs"], f"{data['free']:.0%}", f"**{data['proved']:.0%}**"]
-        cells += [f"{data['prepare_cpu_s']:.0f}", len(runs)]
-        figures |= {"robot": label, "n": len(runs)}
+        cells += [f"{data['prepare_cpu_s']:.0f}", len(runs), len(all_runs) - len(runs)]
+        figures |= {"robot": label, "n": len(runs), "unsolved": len(all_runs) - len(runs)}
         for one in PLANNERS:
             mine = [run[one] for run in runs]
             soon = float(np.mean([run["solved"] and run["cpu_s"] <= SOON for run in mine])) if mine else None
@@ -132,7 +133,7 @@ def write(name: str, rows: Mapping[str, tuple[Figures, list[str]]], **settings: 
     """
     made = [figures.row(label, names) for label, (figures, names) in rows.items()]
     both = [f"{planner}: {what}" for planner in PLANNERS for what in ("in 1 s", "CPU s p50", "p95", "length rad")]
-    head = ["robot", "joints", "pairs", "free", "proved", "prepare CPU s", "N", *both, "unproved pairs"]
+    head = ["robot", "joints", "pairs", "free", "proved", "prepare CPU s", "N", "unsolved by both", *both, "unproved pairs"]
     lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 2), "---"])]
     table = "\n".join([*lines, *(record.row(cells) for _, cells in made)])
     record.write(name, {"robots": [one for one, _ in made]}, table, seed=SEED, states=SAMPLES, limit=f"{TIMEOUT:g} s",
