@@ -40,7 +40,7 @@ from apex_ompl.util.files import check_writable, is_file
 
 ROUNDING = 1e-9  # by which cells are widened [rad], [m]
 FIRST, LAST = 3, (13, 7, 6)  # levels: 2^n cells along each axis at first, and at last by the number of joints
-HOPELESS = 5  # level at which a table of which nothing is proved is given up
+HOPELESS = (10, 6, 5)  # levels at which tables are given up of which nothing is proved, by the number of joints
 SHARE = 1 / 3  # of the time that is left, for one table
 SAFE = 1e-6  # by which bounds are lowered [m]
 ENOUGH = 5e-4  # bound with which a cell is not divided further [m]
@@ -159,7 +159,7 @@ class TableMaker:
                 at = tuple(some[proved].T)
                 cells[at] = np.minimum((bounds[proved] - SAFE) / UNIT, LARGEST)
                 left[at] = False
-            if not left.any() or (level >= HOPELESS and not cells.any()):
+            if not left.any() or (level >= HOPELESS[len(axes) - 1] and not cells.any()):
                 break
         return cells, True
 

@@ -212,11 +212,10 @@ class MotionPlanner:
             from apex_ompl.apex.models import has_model
             from apex_ompl.apex.parameters import NAME
             from apex_ompl.collision.conservative import CheckCounts
-            from apex_ompl.collision.proved_share import share_note
             from apex_ompl.ompl.process import Interrupt, quiet_ompl
             from apex_ompl.planning import motions, steps
             from apex_ompl.planning.departure import departed, with_departure
-            from apex_ompl.planning.query import dynamic_of, snapshot_notes
+            from apex_ompl.planning.query import dynamic_of, robot_notes, snapshot_notes
             from apex_ompl.timing import Timing
 
         options.check()
@@ -231,7 +230,6 @@ class MotionPlanner:
             notes = snapshot_notes(changing) if options.snapshot else []
             if planner is None and not has_model(robot.name):
                 notes.append(f"no model of {robot.name} ships, so random perturbations take the place of proposals")
-            notes += [note for note in (share_note(robot),) if note]
             parameters = planners.chosen(
                 NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
             )
@@ -247,7 +245,7 @@ class MotionPlanner:
                 problem, robot, seed=options.seed, group=options.group, checker=checker, constraints=options.constraints
             )
             departure, setup = departed(given, leave_contact, options.seed) if leave_contact else (None, given)
-            notes += given.notes
+            notes += [*robot_notes(robot), *given.notes]
             notes += [note for note in self._checker.mesh_notes if note not in given.notes]
             if timing is not None:
                 motions.warm_up(checker)
@@ -302,7 +300,6 @@ class MotionPlanner:
         """
         with unforked():
             from apex_ompl.collision.conservative import CheckCounts
-            from apex_ompl.collision.proved_share import share_note
             from apex_ompl.ompl.process import Interrupt
             from apex_ompl.planning import lines
             from apex_ompl.planning.line_query import line_query

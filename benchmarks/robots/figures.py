@@ -133,7 +133,18 @@ def write(name: str, rows: Mapping[str, tuple[Figures, list[str]]], **settings: 
     """
     made = [figures.row(label, names) for label, (figures, names) in rows.items()]
     both = [f"{planner}: {what}" for planner in PLANNERS for what in ("in 1 s", "CPU s p50", "p95", "length rad")]
-    head = ["robot", "joints", "pairs", "free", "proved", "prepare CPU s", "N", "unsolved by both", *both, "unproved pairs"]
+    head = [
+        "robot",
+        "joints",
+        "pairs",
+        "free",
+        "proved",
+        "prepare CPU s",
+        "N",
+        "unsolved by both",
+        *both,
+        "unproved pairs",
+    ]
     lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 2), "---"])]
     table = "\n".join([*lines, *(record.row(cells) for _, cells in made)])
     record.write(name, {"robots": [one for one, _ in made]}, table, seed=SEED, states=SAMPLES, limit=f"{TIMEOUT:g} s",

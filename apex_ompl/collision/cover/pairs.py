@@ -6,7 +6,8 @@ and its own arm), never one arm against the other. Three findings disable a pair
 - by design: both links belong to a soft part, a hand whose fingers touch each other and the palm as its synergy closes;
 - always: in collision at every random state;
 - never: free at every random state, and still ``margin`` apart at the closest state that a local search finds; or, with
-  one joint between them, proved apart over its whole range.
+  one joint between them, apart over its whole range, or in contact as bearings are
+  (:mod:`apex_ompl.collision.cover.neighbors`).
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 
+from apex_ompl.collision.cover.neighbors import reason_of_neighbors
 from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.collision.links import Links
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.robot.config import RobotConfig
 from apex_ompl.robot.model import Robot, link_of
-from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, are_neighbors, enabled_pairs, links_of_pair
+from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, enabled_pairs, links_of_pair
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.validation import check_integer, check_positive, check_seed
 
@@ -35,8 +36,6 @@ STARTS = 4  # closest states from which a local search starts, where the closest
 FAR = 0.3  # ... nearer than this; else it starts from one [m]
 DISTANCES = 2000  # states at which distances are measured
 STEPS = 60  # of a local search
-FINEST = 1e-4  # distance below which no proof is tried [m]
-MOST_INTERVALS = 4000  # of the range of a joint
 SWEEP = 1001  # positions of the synergies of soft parts
 
 
@@ -173,10 +172,8 @@ def _decide(
         for pair, count in zip(pairs, counts, strict=True)
         if count >= enough
     }
+    reasons |= {pair: why for pair in pairs if pair not in reasons and (why := reason_of_neighbors(robot, pair))}
     untouched = [pair for pair, count in zip(pairs, counts, strict=True) if count == 0]
-    reasons |= {
-        pair: f"never, proved over the range of {joint}" for pair in untouched if (joint := apart_over(robot, pair))
-    }
     left = [pair for pair in untouched if pair not in reasons]
     done = first
     while done < search.samples and left:
@@ -207,45 +204,6 @@ def _decide(
         if closest >= search.margin:
             reasons[pair] = f"never in {search.samples} samples, closest found {closest * 1e3:.0f} mm"
     return reasons
-
-
-def apart_over(robot: Robot, pair: Pair) -> str:
-    """Return the joint over whose whole range a pair of geometries is proved apart, or an empty string.
-
-    The pair has this joint alone between them. A joint that moves by x moves no point of a body by more than r x,
-    where r is the largest distance of its points from the axis (or 1, for a prismatic joint). So where a distance
-    exceeds r times half the width of an interval around it, the pair is apart over all of it; other intervals are
-    halved.
-    """
-    model = robot.model
-    joints = [robot.geometry.geometryObjects[k].parentJoint for k in pair]
-    if not are_neighbors(robot, pair):
-        return ""
-    moved = joints[1] if model.parents[joints[1]] == joints[0] else joints[0]
-    if model.names[moved] not in robot.joint_names:  # it mimics another
-        return ""
-    k = robot.joint_names.index(model.names[moved])
-    item = robot.geometry.geometryObjects[pair[joints.index(moved)]]
-    reach = 1.0 if "P" in model.joints[moved].shortname() else _reach(item)
-    alone = SelfCollision(robot, [pair])
-    intervals = [(float(robot.limits.lower[k]), float(robot.limits.upper[k]))]
-    for low, high in intervals:
-        q = robot.home.copy()
-        q[k] = 0.5 * (low + high)
-        distance = float(alone.distances(q)[0])
-        if distance > 0.5 * (high - low) * reach + FINEST:
-            continue
-        if distance < 2.0 * FINEST or len(intervals) > MOST_INTERVALS:
-            return ""
-        intervals += [(low, q[k]), (q[k], high)]
-    return str(robot.joint_names[k])
-
-
-def _reach(item: pin.GeometryObject) -> float:
-    """Return a bound on the distances of a geometry's points from its joint's axis, by those from its origin [m]."""
-    item.geometry.computeLocalAABB()
-    middle = item.placement.act(np.array(item.geometry.aabb_center))
-    return float(np.linalg.norm(middle) + item.geometry.aabb_radius)
 
 
 def _closest(alone: SelfCollision, q: Array) -> float:
