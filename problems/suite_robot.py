@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
+
 from apex_ompl.goals.state_sampling import DualArmTables
 from apex_ompl.problems.broad_representation import Group, given
 from apex_ompl.robot import Robot, load_robot
@@ -15,6 +17,10 @@ from apex_ompl.types import Array
 
 ROBOT = "dual_panda_softhand"
 MARGIN = 0.01  # clearance of every start and goal [m]
+COLUMNS = np.array([[0.0, 0.5], [0.0, -0.5]]), np.full((2, 2), 0.21)
+"""Centers of columns above the arms' bases, and their half widths along x and y, shape (2, 2) [m]."""
+STAYING = ("link0", "link1", "link2")  # ends of the names of links that stay in these columns and cannot evade
+LOW, HIGH = np.array([-0.2, -0.6, 0.1]), np.array([0.6, 0.6, 0.9])  # of the places of held objects [m]
 
 
 def robot() -> Robot:

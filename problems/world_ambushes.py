@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from apex_ompl.problems.catalogue import SuiteError
-from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
+from apex_ompl.problems.world_robot import RobotPlaces, cube
 from apex_ompl.problems.worlds import ScriptedEnvironment
 from apex_ompl.scene.bodies import PlaceInTime
 from apex_ompl.scene.problem import Problem
@@ -125,7 +125,7 @@ class PopupEnvironment(AmbushEnvironment):
             velocity[:2] = self.fastest / np.linalg.norm(heading) * heading
         elif not all(self._is_free(place, q, GOAL_CLEARANCE) for q in (*robot.goals, motion.positions[-1])):
             return None
-        if base_entry(place, velocity, self._edge)[0] < np.inf:
+        if self._robot.around.entry(place, velocity, self._edge)[0] < np.inf:
             return None
         if not self._is_free(place, motion(moment), PLANNED_CLEARANCE):
             return None
@@ -161,7 +161,7 @@ class InterceptorEnvironment(AmbushEnvironment):
             meeting[2] = max(meeting[2], self._edge / 2.0)
             velocity = self.fastest * heading
             place = meeting - lead * velocity
-            if base_entry(place, velocity, self._edge)[0] == np.inf and self._is_free(
+            if self._robot.around.entry(place, velocity, self._edge)[0] == np.inf and self._is_free(
                 place, motion.positions[0], CLEARANCE
             ):
                 self._make(place, velocity, time)
@@ -257,7 +257,7 @@ class PusherEnvironment(ScriptedEnvironment):
         if distance < SPEED * PERIOD:
             return np.zeros(3)
         velocity = SPEED / distance * way
-        return np.zeros(3) if base_entry(here, velocity, self._edge)[0] < 2.0 * PERIOD else velocity
+        return np.zeros(3) if self._robot.around.entry(here, velocity, self._edge)[0] < 2.0 * PERIOD else velocity
 
 
 def _outside(robot: RobotPlaces, edge: float, rng: np.random.Generator) -> Array:
@@ -270,7 +270,7 @@ def _outside(robot: RobotPlaces, edge: float, rng: np.random.Generator) -> Array
             place = hand + distance * np.array([np.cos(angle), np.sin(angle), 0.0])
             place[2] = max(place[2], edge / 2.0)
             if balls.clearance(place, edge) >= gap:
-                if base_entry(place, np.zeros(3), edge)[0] > 0.0:
+                if robot.around.entry(place, np.zeros(3), edge)[0] > 0.0:
                     return place
                 break
     raise SuiteError(f"{robot.problem.name}: no place for a cube of {edge:g} m was found in {PLACES} draws")

@@ -22,7 +22,7 @@ from apex_ompl.problems.world_ambushes import (
     AmbushEnvironment,
     moment_of,
 )
-from apex_ompl.problems.world_robot import base_entry, cube
+from apex_ompl.problems.world_robot import cube
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import place_at, row_of
 from apex_ompl.timing import Trajectory
@@ -111,7 +111,7 @@ class ImposedEnvironment(AmbushEnvironment):
         there = robot.hand(motion(rng.uniform(noticed, motion.duration)), link) - short * heading
         there[2] = max(there[2], self._edge / 2.0)
         here = there - lasts * velocity
-        if base_entry(here, velocity, self._edge)[0] < lasts:
+        if self._robot.around.entry(here, velocity, self._edge)[0] < lasts:
             return None
         if not all(self._is_free(there, q, GOAL_CLEARANCE) for q in (*robot.goals, motion.positions[-1])):
             return None
@@ -135,7 +135,7 @@ class ImposedEnvironment(AmbushEnvironment):
             angle, length = self._rng.uniform(0.0, 2.0 * np.pi), self._rng.uniform(*WAYS)
             heading = np.array([np.cos(angle), np.sin(angle), 0.0])
             there = here + length * heading
-            if base_entry(here, heading, self._edge)[0] < length:
+            if self._robot.around.entry(here, heading, self._edge)[0] < length:
                 continue
             if not all(self._is_free(there, goal, GOAL_CLEARANCE) for goal in self._robot.goals):
                 continue

@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from apex_ompl.problems.catalogue import SuiteError
-from apex_ompl.problems.world_robot import RobotPlaces, base_entry, cube
+from apex_ompl.problems.world_robot import RobotPlaces, Surroundings, cube
 from apex_ompl.problems.worlds import ScriptedEnvironment
 from apex_ompl.scene.bodies import Obstacle, PlaceInTime
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import row_of
 from apex_ompl.types import Array
 
-LOW, HIGH = np.array([-0.2, -0.6, 0.1]), np.array([0.6, 0.6, 0.9])  # of the centers of cubes [m]
 SPEEDS = (0.1, 0.4)  # of which each cube draws one [m/s]
 LEGS = (0.5, 2.0)  # between turns [s]
 START_CLEARANCE = 0.05  # of the robot to a cube at time 0 [m]
@@ -35,6 +34,7 @@ class Wanderer:
 
     Attributes:
         rng: Source of its turns.
+        around: Surroundings of the robot.
         edge: Of the cube [m].
         velocity: Shape (3,) [m/s].
         rows: Its way so far.
@@ -42,6 +42,7 @@ class Wanderer:
     """
 
     rng: np.random.Generator
+    around: Surroundings
     edge: float
     velocity: Array
     rows: list[PlaceInTime]
@@ -55,12 +56,12 @@ class Wanderer:
     def go_on(self) -> None:
         """Append the row of the next turn or reflection."""
         time, place = self.rows[-1][0], np.array(self.rows[-1][1:])
-        low, high = box_of(self.edge)
+        low, high = self.around.box(self.edge)
         while time - self.rows[-1][0] <= SHORTEST:  # in a corner several sides reflect it at once
             ways = np.where(self.velocity > 0.0, high - place, low - place)
             with np.errstate(divide="ignore", invalid="ignore"):
                 walls = np.where(self.velocity == 0.0, np.inf, ways / self.velocity)
-            at_wall, at_base = float(walls.min()), base_entry(place, self.velocity, self.edge)
+            at_wall, at_base = float(walls.min()), self.around.entry(place, self.velocity, self.edge)
             step, axis = min((max(at_wall, 0.0), int(walls.argmin())), at_base)
             if self._turn - time < step:
                 step, axis = self._turn - time, -1
@@ -73,11 +74,6 @@ class Wanderer:
             else:
                 self.velocity = np.where(np.arange(3) == axis, -self.velocity, self.velocity)
         self.rows.append(row_of(time, np.clip(place, low, high)))
-
-
-def box_of(edge: float) -> tuple[Array, Array]:
-    """Return the corners of the box that the center of a cube with an edge [m] stays in, each of shape (3,) [m]."""
-    return np.maximum(LOW, [-np.inf, -np.inf, edge / 2.0]), HIGH
 
 
 def direction(rng: np.random.Generator) -> Array:
@@ -122,9 +118,9 @@ class WanderersEnvironment(ScriptedEnvironment):
 
 
 def _wanderer(robot: RobotPlaces, edge: float, rng: np.random.Generator, turns: bool) -> Wanderer:
-    balls, (low, high) = robot.balls(robot.start), box_of(edge)
+    balls, (low, high) = robot.balls(robot.start), robot.around.box(edge)
     for _ in range(PLACES):
         place, velocity = rng.uniform(low, high), rng.uniform(*SPEEDS) * direction(rng)
-        if base_entry(place, velocity, edge)[0] > 0.0 and balls.clearance(place, edge) >= START_CLEARANCE:
-            return Wanderer(rng, edge, velocity, [row_of(0.0, place)], turns)
+        if robot.around.entry(place, velocity, edge)[0] > 0.0 and balls.clearance(place, edge) >= START_CLEARANCE:
+            return Wanderer(rng, robot.around, edge, velocity, [row_of(0.0, place)], turns)
     raise SuiteError(f"{robot.problem.name}: no place for a cube of {edge:g} m was found in {PLACES} draws")

@@ -38,7 +38,7 @@ from apex_ompl.scene.scripts import fastest, is_there, obstacle_at, recorded
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
-from apex_ompl.util.validation import check_integer, check_name, check_number
+from apex_ompl.util.validation import check_integer, check_name, check_number, check_seed
 
 MOVING_KIND = "moving"
 GENERATED = ("popup", "imposed", "interceptor", "turning", "crowd", "pusher")
@@ -260,19 +260,45 @@ def load(name: str) -> DynamicEnvironment:
 
 def _drawn(world: WorldId) -> DynamicEnvironment:
     """Return the world of an id."""
+    level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())
+    rng = np.random.default_rng([level, world.seed])
+    return _of_kind(world.kind, str(world), problems.load(str(world.problem)), SIZES[world.size], rng)
+
+
+def around(kind: str, problem: Problem, size: str = "large", seed: int = 0) -> DynamicEnvironment:
+    """Return a world of a kind around the problem of any robot, new at each call.
+
+    Where cubes may be is measured for robots other than that of the suites
+    (:func:`apex_ompl.problems.world_robot.surroundings`).
+
+    Args:
+        kind: One of ``GENERATED``.
+        problem: What stands still, and start and goal.
+        size: Of its cubes, one of ``SIZES``.
+        seed: Of what is drawn.
+
+    Raises:
+        UnknownNameError: No such kind or size.
+        ParameterError: The seed is no whole number from 0.
+        SuiteError: There is no place for a cube.
+    """
+    check_name(kind, "kind of worlds", GENERATED)
+    check_name(size, "size of cubes", SIZES)
+    rng = np.random.default_rng([zlib.crc32(f"{kind}/{size}".encode()), check_seed(seed)])
+    return _of_kind(kind, f"{kind}/{problem.name}/{size}/{seed}", problem, SIZES[size], rng)
+
+
+def _of_kind(kind: str, name: str, problem: Problem, edge: float, rng: np.random.Generator) -> DynamicEnvironment:
     from apex_ompl.problems.world_ambushes import InterceptorEnvironment, PopupEnvironment, PusherEnvironment
     from apex_ompl.problems.world_imposed import ImposedEnvironment
     from apex_ompl.problems.world_wanderers import WanderersEnvironment
 
-    level = zlib.crc32(f"{world.kind}/{world.suite}/{world.size}".encode())
-    rng = np.random.default_rng([level, world.seed])
-    name, problem, edge = str(world), problems.load(str(world.problem)), SIZES[world.size]
-    if world.kind == "popup":
+    if kind == "popup":
         return PopupEnvironment(name, problem, edge, rng)
-    if world.kind == "imposed":
+    if kind == "imposed":
         return ImposedEnvironment(name, problem, edge, rng)
-    if world.kind == "interceptor":
+    if kind == "interceptor":
         return InterceptorEnvironment(name, problem, edge, rng)
-    if world.kind == "pusher":
+    if kind == "pusher":
         return PusherEnvironment(name, problem, edge, rng)
-    return WanderersEnvironment(name, problem, edge, rng, turns=world.kind == "turning")
+    return WanderersEnvironment(name, problem, edge, rng, turns=kind == "turning")

@@ -10,6 +10,7 @@ import numpy as np
 from ompl import base as ob
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.proved_share import ENOUGH, proved_share
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import Kernel
 from apex_ompl.ompl.constrained_space import constraint_of, refuse_constraints
@@ -44,6 +45,8 @@ class PathValidator:
         checker: Collision checker of the robot, among its obstacles where they are known.
         knows_obstacles: Whether the obstacles are known.
         exclusive: Whether this project's checker alone decides.
+        by_spheres: Whether it does, and spheres prove so many states of the robot that searches which go only where
+            they prove are the fastest.
         constraints: Constraints along paths, of this project's checker or of the state space, or None for none.
     """
 
@@ -75,6 +78,7 @@ class PathValidator:
             self.exclusive = type(validity_checker).isValid is StateValidityChecker.isValid and plain
         else:
             self.checker, self.exclusive = CollisionChecker(_robot_of(si, robot)), False
+        self.by_spheres = self.exclusive and proved_share(self.checker.robot) >= ENOUGH
         dof, dimension = self.checker.robot.dof, int(si.getStateSpace().getDimension())
         if dof != dimension:
             expected = f"{dof} dimensions, those of {self.checker.robot.name}, or another robot by robot=..."

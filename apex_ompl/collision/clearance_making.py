@@ -27,25 +27,25 @@ from apex_ompl.collision.clearance_tables import (
     table_range,
     write_clearances,
 )
-from apex_ompl.collision.cover.quick import covers_of
 from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays
-from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.tables import joint_tree, tabulate
+from apex_ompl.collision.links import Links
+from apex_ompl.collision.tables import joint_tree
 from apex_ompl.kernel.arrays import pack
 from apex_ompl.kernel.box_bound import BoxBounds
 from apex_ompl.kernel.clearance_table import LARGEST, UNIT
-from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.products import product
-from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
 from apex_ompl.util.files import check_writable, is_file
 
 ROUNDING = 1e-9  # by which cells are widened [rad], [m]
 FIRST, LAST = 3, (13, 7, 6)  # levels: 2^n cells along each axis at first, and at last by the number of joints
+HOPELESS = (10, 6, 5)  # levels at which tables are given up of which nothing is proved, by the number of joints
 SHARE = 1 / 3  # of the time that is left, for one table
 SAFE = 1e-6  # by which bounds are lowered [m]
 ENOUGH = 5e-4  # bound with which a cell is not divided further [m]
+NEAR = 2e-3  # bound that is tried first [m]
+FEW, MOSTLY = 16, 0.5  # cells, and share of them without a larger bound, from which larger bounds are given up
 SAMPLES = 500  # states at which the covers are tried
 AT_ONCE = 256  # cells between two readings of the clock
 
@@ -92,20 +92,17 @@ class TableMaker:
             FileFormatError: That file does not follow its schema.
             RobotError: The kernel does not support the motion of a joint.
         """
-        stage, tree = MeshStage(robot), joint_tree(robot)
-        self._robot, self._solids = robot, [stage.solids[k] for k in range(stage.links)]
-        tables = tabulate(
-            robot, solids=self._solids, numbers=range(stage.links), pairs=stage.body_pairs,
-            covers=covers_of(robot, [solid.shape for solid in self._solids]), meets_scene=[False] * stage.links,
-        )  # fmt: skip
-        self._kernel = Kernel(tables, scene_tables([]))
-        self._row = {number: row for row, number in enumerate(tables.numbers)}
-        bodies = [self._solids[number] for number in tables.numbers]
+        links, tree = Links.of(robot), joint_tree(robot)
+        self._robot, self._solids = robot, links.solids
+        numbers = links.kernel.robot.numbers
+        self._row = {number: row for row, number in enumerate(numbers)}
+        bodies = [self._solids[number] for number in numbers]
         arrays = shape_arrays(
             [PlacedShape(s.shape, s.joint, product(tree.turns[s.joint].T, s.placement.homogeneous)) for s in bodies]
         )
-        self._radii, self._bounds = arrays.ball[:, 3], BoxBounds(self._kernel, pack(arrays))
-        near, shares = near_pairs(robot, tree, self._solids, stage.body_pairs), self._open_shares()
+        self._radii, self._bounds = arrays.ball[:, 3], BoxBounds(links.kernel, pack(arrays))
+        self._dense = set[tuple[int, int]]()  # pairs whose larger bounds take too many triangles
+        near, shares = near_pairs(robot, tree, self._solids, links.pairs), _open_shares(robot, links)
         self.pairs = sorted(
             (p for p in near if p.links in shares), key=lambda p: (len(p.sources) // 3, -shares[p.links], p.links)
         )
@@ -116,18 +113,25 @@ class TableMaker:
         first, second = (self._solids[k] for k in pair.links)
         return first.part or first.name, second.part or second.name
 
-    def _open_shares(self) -> dict[tuple[int, int], float]:
-        """Return for pairs of links the share of random states at which the covers leave them open."""
-        states, numbers = self._robot.random_state(np.random.default_rng(0), SAMPLES), self._kernel.robot.numbers
-        left, counts = self._kernel.unproved(states, most=len(self._kernel.robot.arrays.bodies) + 1)
-        found = np.concatenate([rows[: max(count, 0)] for rows, count in zip(left, counts, strict=True)])
-        counted = Counter((min(pair), max(pair)) for pair in ((numbers[a], numbers[b]) for a, b in found.tolist()))
-        return {pair: count / SAMPLES for pair, count in counted.items()}
-
     def bounds(self, pair: NearPair, middles: Array, half: Array, *, least: float, need: float) -> Array:
         """Return :meth:`apex_ompl.kernel.box_bound.BoxBounds.over` of two links, the smaller of which moves."""
         first, second = sorted((self._row[k] for k in pair.links), key=lambda row: self._radii[row])
         return self._bounds.over(first, second, middles, half, least=least, need=need)
+
+    def _bounds_over(self, pair: NearPair, middles: Array, half: Array, least: float) -> Array:
+        """Return lower bounds of the distance of two links over boxes; those below ``least`` are minus infinity [m].
+
+        The smaller the bound that suffices, the fewer triangles are examined: NEAR is tried first, and larger ones for
+        pairs of which those do not fail mostly.
+        """
+        found = self.bounds(pair, middles, half, least=least, need=NEAR + SAFE)
+        proved = np.flatnonzero(found >= least)
+        if pair.links not in self._dense and len(proved):
+            far = self.bounds(pair, middles[proved], half, least=least, need=(LARGEST + 1) * UNIT + SAFE)
+            found[proved] = np.maximum(found[proved], far)
+            if len(far) >= FEW and np.mean(np.isneginf(far)) > MOSTLY:
+                self._dense.add(pair.links)
+        return found
 
     def make(self, pair: NearPair, seconds: float) -> tuple[Cells, bool]:
         """Return the cells of a pair's table, and whether the CPU time sufficed [s]; cells are unproved where not."""
@@ -150,12 +154,12 @@ class TableMaker:
                     return cells, False
                 middles = np.repeat(middle[None], len(some), axis=0)
                 middles[:, axes] = lower + (some + 0.5) * width
-                bounds = self.bounds(pair, middles, half, least=enough + SAFE, need=(LARGEST + 1) * UNIT + SAFE)
+                bounds = self._bounds_over(pair, middles, half, enough + SAFE)
                 proved = bounds >= enough + SAFE
                 at = tuple(some[proved].T)
                 cells[at] = np.minimum((bounds[proved] - SAFE) / UNIT, LARGEST)
                 left[at] = False
-            if not left.any():
+            if not left.any() or (level >= HOPELESS[len(axes) - 1] and not cells.any()):
                 break
         return cells, True
 
@@ -182,6 +186,13 @@ class TableMaker:
                 table, took = table_of(self._robot, pair, cells), time.process_time() - began
                 progress(TableReport(self.names(pair), table.joints, share, table.proved, len(cells), took, complete))
         return found
+
+
+def _open_shares(robot: Robot, links: Links) -> dict[tuple[int, int], float]:
+    """Return for pairs of links the share of random states at which the covers leave them open."""
+    states = robot.random_state(np.random.default_rng(0), SAMPLES)
+    counted = Counter(pair for some in links.open_pairs(states) for pair in (links.pairs if some is None else some))
+    return {pair: count / SAMPLES for pair, count in counted.items()}
 
 
 def _doubled(array: NDArray[Any]) -> NDArray[Any]:

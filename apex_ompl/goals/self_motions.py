@@ -87,7 +87,7 @@ def search(
             if not error <= REACHED:
                 missed.append(q)
                 continue
-            away = float(np.abs(robot.turned_to(states, q) - q).max(axis=1).min(initial=np.inf)) if len(states) else np.inf
+            away = float(np.abs(robot.turned_to(states, q) - q).max(axis=1).min(initial=np.inf))
             redundant = _redundancy(inverse, q) if away > SAME else 0
             if away <= (SPACING if redundant else SAME):
                 idle += 1

@@ -269,7 +269,7 @@ class MotionPlanner:
             from apex_ompl.ompl.process import Interrupt, quiet_ompl
             from apex_ompl.planning import motions, steps
             from apex_ompl.planning.departure import departed, with_departure
-            from apex_ompl.planning.query import dynamic_of, snapshot_notes
+            from apex_ompl.planning.query import dynamic_of, robot_notes, snapshot_notes
             from apex_ompl.timing import Timing
 
         options.check()
@@ -299,7 +299,7 @@ class MotionPlanner:
                 problem, robot, seed=options.seed, group=options.group, checker=checker, constraints=options.constraints
             )
             departure, setup = departed(given, leave_contact, options.seed) if leave_contact else (None, given)
-            notes += given.notes
+            notes += [*robot_notes(robot), *given.notes]
             notes += [note for note in self._checker.mesh_notes if note not in given.notes]
             if timing is not None:
                 motions.warm_up(checker)

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from apex_ompl.collision.proved_share import share_note
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
@@ -205,6 +206,12 @@ def dynamic_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
             "snapshot", False, f"True, since the obstacle {scripted!r} follows a script, which `apex-ompl run` runs"
         )
     return dynamic
+
+
+def robot_notes(robot: Robot) -> list[str]:
+    """Return notes on a robot that is planned for more slowly than others."""
+    note = share_note(robot)
+    return [note] if note else []
 
 
 def snapshot_notes(obstacles: Sequence[Obstacle]) -> list[str]:

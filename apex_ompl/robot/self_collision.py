@@ -35,12 +35,14 @@ class SelfCollision:
         """
         self.robot = robot
         self.pairs = enabled_pairs(robot) if pairs is None else list(pairs)
-        self._data, self._geometry = robot.model.createData(), robot.geometry.copy()
-        self._geometry.removeAllCollisionPairs()
-        for pair in self.pairs:
-            self._geometry.addCollisionPair(pin.CollisionPair(*pair))
-        for k, shape in (shapes or {}).items():
-            self._geometry.geometryObjects[k].geometry = shape
+        self._data, self._geometry = robot.model.createData(), pin.GeometryModel()
+        place = {}  # of geometries that are part of a pair
+        for k in dict.fromkeys(k for pair in self.pairs for k in pair):
+            item = robot.geometry.geometryObjects[k].copy()
+            item.geometry = (shapes or {}).get(k, item.geometry)
+            place[k] = self._geometry.addGeometryObject(item)
+        for first, second in self.pairs:
+            self._geometry.addCollisionPair(pin.CollisionPair(place[first], place[second]))
         self._results = self._geometry.createData()
 
     def colliding(self, q: Array) -> Flags:
@@ -48,6 +50,16 @@ class SelfCollision:
         q = self.robot.to_pinocchio(q)
         pin.computeCollisions(self.robot.model, self._data, self._geometry, self._results, q, False)
         return np.array([result.isCollision() for result in self._results.collisionResults], bool)
+
+    def colliding_among(self, q: Array, chosen: Sequence[int]) -> Flags:
+        """Return which pairs of some, by their places in ``pairs``, collide at a state, shape (pairs,)."""
+        found = np.zeros(len(self.pairs), bool)
+        if len(chosen):
+            q = self.robot.to_pinocchio(q)
+            pin.updateGeometryPlacements(self.robot.model, self._data, self._geometry, self._results, q)
+            for k in chosen:
+                found[k] = pin.computeCollision(self._geometry, self._results, int(k))
+        return found
 
     def hits(self, states: Iterable[Array]) -> Flags:
         """Return which pairs collide at states, shape (states, pairs)."""

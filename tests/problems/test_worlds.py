@@ -15,16 +15,18 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.problems import world_wanderers, worlds
 from apex_ompl.problems.alignment import SIZES
-from apex_ompl.problems.suite_robot import robot
+from apex_ompl.problems.suite_robot import COLUMNS, robot
 from apex_ompl.problems.world_ambushes import moment_of
-from apex_ompl.problems.world_robot import BASE_REACH, BASES, RobotPlaces, base_entry, cube
+from apex_ompl.problems.world_robot import RobotPlaces, cube, surroundings
 from apex_ompl.problems.worlds import DynamicEnvironment
+from apex_ompl.robot import load_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at, place_at
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.types import Array
 
+BASES, BASE_REACH = COLUMNS[0], COLUMNS[1][0, 0]
 STEP, BEGIN = 0.01, 0.25  # of the clock, and when the first motion begins [s]
 seeds = st.integers(0, 999)
 sizes, suites, paces = (
@@ -365,7 +367,7 @@ def test_wanderers_stay_before_the_robot(kind: str, suite: str, size: str, seed:
     for one in start:
         assert exact(world, one).obstacle_distance(q[None]) >= world_wanderers.START_CLEARANCE
     world.advance(120.0, q)
-    low, high = world_wanderers.box_of(edge)
+    low, high = surroundings(robot()).box(edge)
     for o in world.script():
         rows = np.array(o.trajectory)
         lengths, speeds = (
@@ -436,7 +438,7 @@ def test_pushers_answer_to_the_robot() -> None:
 )  # fmt: skip
 def test_columns_above_the_bases_are_entered_when_samples_say(place: tuple, velocity: tuple, edge: float) -> None:
     place, velocity = np.array(place), np.round(np.array(velocity), 3)
-    time, axis = base_entry(place, velocity, edge)
+    time, axis = surroundings(robot()).entry(place, velocity, edge)
     half = BASE_REACH + edge / 2
 
     def depth(t: float) -> float:
@@ -450,6 +452,43 @@ def test_columns_above_the_bases_are_entered_when_samples_say(place: tuple, velo
         if time > 0.0:
             sides = [abs(abs((place + time * velocity)[axis] - base[axis]) - half) for base in BASES]
             assert min(sides) < 1e-6 and velocity[axis] != 0.0
+
+
+def post_problem() -> Problem:
+    """A problem of another robot, without held objects: a turn of its first joint."""
+    arm = load_robot("panda")
+    start, goal = (dict(zip(arm.joint_names, (turn, *arm.home[1:]), strict=True)) for turn in (-1.2, 1.2))
+    return Problem(name="post", robot="panda", start=start, goal={"joints": [goal]})
+
+
+def test_another_robot_has_columns_that_contain_what_cannot_evade() -> None:
+    arm, places = load_robot("panda"), RobotPlaces(post_problem())
+    around = surroundings(arm)
+    assert places.hands == ("panda_hand",) and {"panda_link0_0", "panda_link1_0"} <= set(around.staying)
+    assert "panda_link4_0" not in around.staying
+    middles, halves = around.columns
+    for q in arm.random_state(np.random.default_rng(5), 20):
+        every, evading = places.balls(q), {tuple(c) for c in places.balls(q, evading=True).centers}
+        stays = np.array([tuple(c) not in evading for c in every.centers])
+        beyond = np.abs(every.centers[stays, None, :2] - middles) + every.radii[stays, None, None] - halves
+        assert beyond.max(axis=2).min(axis=1).max() < 0.02
+        hand = places.hand(q, "panda_hand")
+        assert np.linalg.norm(hand - arm.link_pose(q, "panda_hand")[:3, 3]) == 0.0
+
+
+@pytest.mark.parametrize("kind", worlds.GENERATED)
+def test_worlds_of_all_kinds_are_made_for_another_robot(kind: str) -> None:
+    first, again = (worlds.around(kind, post_problem(), "large", 3) for _ in range(2))
+    arm, problem = load_robot("panda"), post_problem()
+    line = np.stack([problem.start_state(arm.joint_names), problem.goal_states(arm.joint_names)[0]])
+    motion = time_path(line, arm.limits, arm.joint_names, Timing(velocity_scale=0.25)).trajectory
+    assert motion is not None
+    seen, same = run(first, motion, 3.0, 0.05), run(again, motion, 3.0, 0.05)
+    assert seen == same and first.name == f"{kind}/post/large/3"
+    assert any(present for _, present in seen)
+    check_consistency(first, seen)
+    with pytest.raises(UnknownNameError):
+        worlds.around("rain", post_problem())
 
 
 def test_balls_contain_the_robot_and_columns_what_cannot_evade() -> None:

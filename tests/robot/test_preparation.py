@@ -9,7 +9,8 @@ from toy_robot import LIMIT, write_toy
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.cover import preparation
-from apex_ompl.collision.cover.pairs import PairSearch, apart_over
+from apex_ompl.collision.cover.neighbors import apart_over, reason_of_neighbors, taken_in
+from apex_ompl.collision.cover.pairs import PairSearch
 from apex_ompl.collision.cover.preparation import Preparation, prepare
 from apex_ompl.collision.cover.spheres import make_cover, read_covers, read_efforts, unproved
 from apex_ompl.collision.cover.survey import survey
@@ -54,7 +55,8 @@ def test_a_prepared_robot_names_its_files_and_keeps_its_comments(tmp_path: Path,
         done = prepare(path, QUICK)
         assert done.thorough and done.pairs == 3 and done.covers == {1: 1} and done.missing == 0
         text = path.read_text()
-        assert text.startswith(FILE) and text.endswith(f"disabled_pairs: {pairs}\ncovers: {covers}\n")
+        lines = sorted(text.removeprefix(FILE).splitlines())
+        assert text.startswith(FILE) and lines == [f"covers: {covers}", f"disabled_pairs: {pairs}"]
         robot = load_robot(path)
         assert robot.covers == tmp_path / covers and not robot.geometry.collisionPairs
         assert read_disabled_pairs(tmp_path / pairs) == [("base", "on"), ("base", "tip"), ("on", "tip")]
@@ -81,7 +83,7 @@ def test_what_is_done_is_not_done_again(tmp_path: Path, monkeypatch: pytest.Monk
     real = preparation._made
     monkeypatch.setattr(preparation, "make_cover", lambda shape, effort: make_cover(shape, effort=1))
     monkeypatch.setattr(preparation, "_made", one_at_a_time)  # as if stopped after one
-    for left in (2, 1, 0):
+    for left in (1, 0):  # after quick covers at first, and again with the time that is left
         done = prepare(path, QUICK)
         assert done.missing == left and done.thorough == (left == 0)
     assert [len(keys) for keys, _ in made] == [3, 2, 1] and set(made[2][0]) < set(made[1][0]) < set(made[0][0])
@@ -137,6 +139,24 @@ def test_neighbors_are_proved_apart_over_a_joint_as_by_brute_force(tmp_path: Pat
         states[:, 1] = np.linspace(robot.limits.lower[1], robot.limits.upper[1], 2000)
         assert apart_over(robot, pair) == ("" if checks.hits(states).any() else "joint2")
         assert checks.hits(states).any() == (reach > 2.0)
+
+
+@pytest.mark.parametrize(("gap", "reason"), [(0.05, "never, at"), (-0.3, "adjacent"), (-1.6, "")])
+def test_neighbors_that_touch_as_bearings_do_are_told_from_others(tmp_path: Path, gap: float, reason: str) -> None:
+    cube = "".join(f"v {x} {y} {z}\n" for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1))
+    sides = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
+    faces = "".join(f"f {a} {b} {c}\nf {a} {c} {d}\n" for a, b, c, d in map(str.split, sides))
+    (tmp_path / "cube.obj").write_text(cube + faces)
+    body = '<collision><geometry><mesh filename="cube.obj"/></geometry></collision>'
+    text = BARS.replace(BAR, body).replace('xyz="0 0 0.3"', f'xyz="0 0 {0.1 + 1e-3 * gap}"')
+    (tmp_path / "my.robot.yaml").write_text(FILE)
+    (tmp_path / "my.urdf").write_text(text.replace('axis xyz="0 1 0"', 'axis xyz="0 0 1"'))
+    robot, _, _ = bare_robot(str(tmp_path / "my.robot.yaml"))
+    (pair,) = [p for p in enabled_pairs(robot) if links_of_pair(robot, p) == ("base", "on")]
+    assert reason_of_neighbors(robot, pair).startswith(reason) and (reason or not reason_of_neighbors(robot, pair))
+    mesh = robot.geometry.geometryObjects[0].geometry
+    inner, outer = np.array(taken_in(mesh, 0.01).vertices()), np.array(mesh.vertices())
+    assert np.allclose(np.linalg.norm(inner - outer, axis=1), 0.01) and (np.abs(inner - 0.05) < 0.0465).all()
 
 
 def test_soft_parts_are_parts_of_the_robot(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from apex_ompl.types import Array
 
 DETOUR, OTHERS = 1.7, 2  # times the straight line's length, beyond which so many other trees are tried
 ITERATIONS = 6_000  # of each of these
-MOTIONS = 500  # that are checked to cut a polyline short where another checker decides
+MOTIONS = 500  # that are checked to cut a polyline short where spheres do not decide
 PASSES, IDLE, MIN_GAIN = 4, 2, 0.02  # over such a path; it ends after IDLE that shorten by less than MIN_GAIN
 
 
@@ -72,7 +72,8 @@ class Shorten:
     def _cut_short(self, context: SolveContext, states: Array) -> list[Array]:
         """Return a polyline after shortcuts, and others where it takes a detour; the shortest first."""
         found, weights = [_shortcut(context, states)], context.kernel.robot.arrays.weight
-        if self.tree_range is None:
+        slow = context.validator.exclusive and not context.validator.by_spheres  # trees are checked by meshes
+        if self.tree_range is None or slow:
             return found
         for _ in range(OTHERS):
             if context.stop() or path_length(found[0], weights) <= DETOUR * path_length(states[[0, -1]], weights):
@@ -94,7 +95,7 @@ class Shorten:
 
 def _another(context: SolveContext, states: Array, tree_range: float) -> Array | None:
     """Return another path between the ends of one, shape (N, dof), by new trees, or None."""
-    if context.validator.exclusive:
+    if context.validator.by_spheres:
         trees = compiled_trees(context, [states[0]], [states[-1]], tree_range)
         return grow(context, trees, ITERATIONS)
     tree, pdef = ompl_trees(context.validator.si, [states[0]], states[-1], tree_range)
@@ -105,7 +106,7 @@ def _another(context: SolveContext, states: Array, tree_range: float) -> Array |
 
 def _shortcut(context: SolveContext, states: Array) -> Array:
     """Return a polyline cut short."""
-    if not context.validator.exclusive:
+    if not context.validator.by_spheres:
         left = iter(range(MOTIONS))
         return simplify(context.validator.si, states, lambda: context.stop() or next(left, None) is None)
     short, looked = shortcut(context.kernel, states, ENOUGH, RESOLUTION, context.rng.spawn(1)[0], context.stop)

@@ -2,7 +2,8 @@
 
 Where this project's checker decides, trees grow in compiled code (:class:`apex_ompl.kernel.search.TreePair`), several
 times as fast as OMPL's, which ask for each motion. They go only where the spheres prove that it is free; OMPL's
-RRTConnect, with the exact check, has its turns beside them, and is what runs with another checker.
+RRTConnect, with the exact check, has its turns beside them, and is what runs with another checker, and for a robot of
+whose free states the spheres prove few (:mod:`apex_ompl.collision.proved_share`).
 
 Bridges are short trees that plan blocked stretches of the best candidates anew. At the end of the search, turns of
 trees and rounds of proposals share what time is left.
@@ -186,7 +187,7 @@ def every_other(states: Array) -> Array:
 
 def _bridge(context: SolveContext, a: Array, b: Array, tree_range: float, calls: int) -> Array | None:
     """Return a path of RRT-Connect between two free states, or None."""
-    if context.validator.exclusive:
+    if context.validator.by_spheres:
         found = grow(context, compiled_trees(context, [a], [b], tree_range), calls)
         if found is not None:
             return found
@@ -210,7 +211,7 @@ class Sprint:
     In open scenes it is done sooner than proposals are made.
 
     Attributes:
-        iterations: Number of iterations of compiled trees; OMPL's have OMPL_SHARE of it.
+        iterations: Number of iterations of compiled trees; OMPL's have OMPL_SHARE of it where another checker decides.
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
     """
 
@@ -222,7 +223,7 @@ class Sprint:
         if context.stop():
             return None
         with context.report.timed("sprint"):
-            states = self._compiled(context) if context.validator.exclusive else self._of_ompl(context)
+            states = self._compiled(context) if context.validator.by_spheres else self._of_ompl(context)
         return None if states is None else verified(context, states, "sprint", self)
 
     def _compiled(self, context: SolveContext) -> Array | None:
@@ -237,11 +238,13 @@ class Sprint:
     def _of_ompl(self, context: SolveContext) -> Array | None:
         """Return the path of OMPL's trees, with OMPL's longest step first: other checkers' scenes may be wide open."""
         start, goal = context.pairs[0]
-        for tree_range in dict.fromkeys((0.0, self.tree_range)):
+        exclusive = context.validator.exclusive
+        calls = self.iterations if exclusive else math.ceil(OMPL_SHARE * self.iterations)
+        for tree_range in (self.tree_range,) if exclusive else dict.fromkeys((0.0, self.tree_range)):
             trees = context.sprint_ompl_trees.get(tree_range)
             trees = trees or rooted_ompl_trees(context, [start], goal, tree_range)
             tree, pdef = context.sprint_ompl_trees[tree_range] = trees
-            if tree.solve(context.counted(math.ceil(OMPL_SHARE * self.iterations))).getStatus() == EXACT:
+            if tree.solve(context.counted(calls)).getStatus() == EXACT:
                 context.sprint_ompl_trees.clear()
                 return path_to_array(pdef.getSolutionPath(), context.kernel.robot.dof)
         return None
@@ -264,7 +267,7 @@ class GrowTrees:
 
     def run(self, context: SolveContext, iterations: int) -> Solution | None:
         """Return the path of the trees after some more iterations, of which OMPL's have OMPL_SHARE, or None."""
-        if context.validator.exclusive:
+        if context.validator.by_spheres:
             found = self._compiled(context, iterations)
             if found is not None:
                 return found

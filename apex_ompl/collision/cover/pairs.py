@@ -6,7 +6,8 @@ and its own arm), never one arm against the other. Three findings disable a pair
 - by design: both links belong to a soft part, a hand whose fingers touch each other and the palm as its synergy closes;
 - always: in collision at every random state;
 - never: free at every random state, and still ``margin`` apart at the closest state that a local search finds; or, with
-  one joint between them, proved apart over its whole range.
+  one joint between them, apart over its whole range, or in contact as bearings are
+  (:mod:`apex_ompl.collision.cover.neighbors`).
 """
 
 from __future__ import annotations
@@ -16,25 +17,25 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 
+from apex_ompl.collision.cover.neighbors import reason_of_neighbors
 from apex_ompl.collision.hulls import convex_hull
+from apex_ompl.collision.links import Links
 from apex_ompl.errors import UnknownNameError
 from apex_ompl.robot.config import RobotConfig
 from apex_ompl.robot.model import Robot, link_of
-from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, are_neighbors, enabled_pairs, links_of_pair
-from apex_ompl.types import Array
+from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, enabled_pairs, links_of_pair
+from apex_ompl.types import Array, Flags
 from apex_ompl.util.validation import check_integer, check_positive, check_seed
 
 Pair = tuple[int, int]
 
 FIRST = 500  # states at which all pairs are checked; those that touch at none remain
-CHUNK = 1000  # states between looks at the time
-STARTS = 4  # closest states from which a local search starts
+CHUNK = 250  # states between looks at the time
+STARTS = 4  # closest states from which a local search starts, where the closest is ...
+FAR = 0.3  # ... nearer than this; else it starts from one [m]
 DISTANCES = 2000  # states at which distances are measured
 STEPS = 60  # of a local search
-FINEST = 1e-4  # distance below which no proof is tried [m]
-MOST_INTERVALS = 4000  # of the range of a joint
 SWEEP = 1001  # positions of the synergies of soft parts
 
 
@@ -67,6 +68,8 @@ def disabled_pairs(
     search: PairSearch,
     deadline: float = np.inf,
     progress: Callable[[float], object] = lambda share: None,
+    *,
+    links: Links | None = None,
 ) -> list[tuple[tuple[str, str], str]]:
     """Return the pairs of links to disable, sorted, with their reasons.
 
@@ -78,6 +81,7 @@ def disabled_pairs(
         search: Settings.
         deadline: By ``time.monotonic`` [s].
         progress: Called with the share of the work that is done.
+        links: The links with covers, which save most checks of meshes.
 
     Returns:
         Links of each pair, and the reason.
@@ -92,7 +96,7 @@ def disabled_pairs(
     inside = [pair for pair in pairs if (parts := _parts(robot, pair))[0] == parts[1] and parts[0] in search.soft]
     reasons = dict(zip(inside, _sweep(robot, inside), strict=True))
     rest = [pair for pair in pairs if pair not in reasons]
-    reasons |= _decide(robot, rest, search, deadline, progress)
+    reasons |= _decide(robot, rest, search, deadline, progress, links=links)
     return _by_links(robot, pairs, reasons)
 
 
@@ -134,30 +138,49 @@ def _sweep(robot: Robot, pairs: list[Pair]) -> list[str]:
     return ["never in a sweep of the synergy" if np.isnan(s) else f"by design, from synergy {s:.3f}" for s in first]
 
 
+class _Hits:
+    """Which of some pairs collide at states; only those that covers leave open are checked by their meshes."""
+
+    def __init__(self, robot: Robot, pairs: Sequence[Pair], links: Links | None) -> None:
+        self._meshes, self._links = SelfCollision(robot, pairs), links
+        self._place = {(min(pair), max(pair)): k for k, pair in enumerate(pairs)}
+
+    def __call__(self, states: Array) -> Flags:
+        """Return the hits at states, shape (states, pairs)."""
+        if self._links is None:
+            return self._meshes.hits(states)
+        found = np.zeros((len(states), len(self._place)), bool)
+        for row, (q, some) in enumerate(zip(states, self._links.open_pairs(states), strict=True)):
+            if some is None:
+                found[row] = self._meshes.colliding(q)
+            else:
+                found[row] = self._meshes.colliding_among(q, [self._place[p] for p in some if p in self._place])
+        return found
+
+
 def _decide(
-    robot: Robot, pairs: list[Pair], search: PairSearch, deadline: float, progress: Callable[[float], object]
-) -> dict[Pair, str]:
+    robot: Robot, pairs: list[Pair], search: PairSearch, deadline: float, progress: Callable[[float], object],
+    *, links: Links | None,
+) -> dict[Pair, str]:  # fmt: skip
     """Return pair -> reason for the pairs that always or never touch."""
     rng = np.random.default_rng(search.seed)
     first = min(FIRST, search.samples)
-    counts = SelfCollision(robot, pairs).hits(robot.random_state(rng, first)).sum(axis=0)
+    counts = _Hits(robot, pairs, links)(robot.random_state(rng, first)).sum(axis=0)
     enough = ALWAYS * first
     reasons = {
         pair: f"always, in {count} of {first} samples"
         for pair, count in zip(pairs, counts, strict=True)
         if count >= enough
     }
+    reasons |= {pair: why for pair in pairs if pair not in reasons and (why := reason_of_neighbors(robot, pair))}
     untouched = [pair for pair, count in zip(pairs, counts, strict=True) if count == 0]
-    reasons |= {
-        pair: f"never, proved over the range of {joint}" for pair in untouched if (joint := apart_over(robot, pair))
-    }
     left = [pair for pair in untouched if pair not in reasons]
     done = first
     while done < search.samples and left:
         if time.monotonic() > deadline:
             return reasons
         chunk = robot.random_state(rng, min(CHUNK, search.samples - done))
-        hits = SelfCollision(robot, left).hits(chunk)
+        hits = _Hits(robot, left, links)(chunk)
         left = [pair for k, pair in enumerate(left) if not hits[:, k].any()]
         done += len(chunk)
         progress(0.5 * done / search.samples)
@@ -173,7 +196,8 @@ def _decide(
         progress(0.5 + 0.5 * k / len(left))
         closest = float(table[:, k].min())
         alone = SelfCollision(robot, [pair], {k: hulls[k] for k in pair})
-        for q in states[np.argsort(table[:, k])[:STARTS]]:
+        starts = STARTS if closest < FAR else 1
+        for q in states[np.argsort(table[:, k])[:starts]]:
             if closest < search.margin:
                 break
             closest = min(closest, _closest(alone, q))
@@ -182,58 +206,19 @@ def _decide(
     return reasons
 
 
-def apart_over(robot: Robot, pair: Pair) -> str:
-    """Return the joint over whose whole range a pair of geometries is proved apart, or an empty string.
-
-    The pair has this joint alone between them. A joint that moves by x moves no point of a body by more than r x,
-    where r is the largest distance of its points from the axis (or 1, for a prismatic joint). So where a distance
-    exceeds r times half the width of an interval around it, the pair is apart over all of it; other intervals are
-    halved.
-    """
-    model = robot.model
-    joints = [robot.geometry.geometryObjects[k].parentJoint for k in pair]
-    if not are_neighbors(robot, pair):
-        return ""
-    moved = joints[1] if model.parents[joints[1]] == joints[0] else joints[0]
-    if model.names[moved] not in robot.joint_names:  # it mimics another
-        return ""
-    k = robot.joint_names.index(model.names[moved])
-    item = robot.geometry.geometryObjects[pair[joints.index(moved)]]
-    reach = 1.0 if "P" in model.joints[moved].shortname() else _reach(item)
-    alone = SelfCollision(robot, [pair])
-    lower, upper = robot.range_around()
-    intervals = [(float(lower[k]), float(upper[k]))]
-    for low, high in intervals:
-        q = robot.home.copy()
-        q[k] = 0.5 * (low + high)
-        distance = float(alone.distances(q)[0])
-        if distance > 0.5 * (high - low) * reach + FINEST:
-            continue
-        if distance < 2.0 * FINEST or len(intervals) > MOST_INTERVALS:
-            return ""
-        intervals += [(low, q[k]), (q[k], high)]
-    return str(robot.joint_names[k])
-
-
-def _reach(item: pin.GeometryObject) -> float:
-    """Return a bound on the distances of a geometry's points from its joint's axis, by those from its origin [m]."""
-    item.geometry.computeLocalAABB()
-    middle = item.placement.act(np.array(item.geometry.aabb_center))
-    return float(np.linalg.norm(middle) + item.geometry.aabb_radius)
-
-
 def _closest(alone: SelfCollision, q: Array) -> float:
     """Return the least distance of a single pair that a descent from a state finds [m].
 
     The direction is that of the signed gradient by finite differences, scaled by the ranges of the joints; the step is
     halved where it does not help.
     """
+    moving = _moving(alone.robot, alone.pairs[0])
     low, high = alone.robot.limits.lower, alone.robot.limits.upper
     span = np.minimum(high - low, 2.0 * np.pi)
     best, step = float(alone.distances(q)[0]), 0.1
     for _ in range(STEPS):
         slope = np.zeros(len(q))
-        for k in range(len(q)):
+        for k in moving:
             moved = q.copy()
             change = 1e-4 * span[k] * (1.0 if q[k] + 1e-4 * span[k] <= high[k] else -1.0)
             moved[k] += change
@@ -251,3 +236,10 @@ def _closest(alone: SelfCollision, q: Array) -> float:
         else:
             break
     return best
+
+
+def _moving(robot: Robot, pair: Pair) -> list[int]:
+    """Return the planned joints, by their numbers, that move the geometries of a pair against each other."""
+    model = robot.model
+    chains = [set(model.supports[robot.geometry.geometryObjects[k].parentJoint]) for k in pair]
+    return sorted({int(robot.state_order[model.joints[joint].idx_q]) for joint in chains[0] ^ chains[1]})

@@ -2,8 +2,8 @@
 
 Files are written beside the robot file as soon as there is something to write, and name how far they are, so that a
 preparation that was stopped goes on where it was. Covers are made quickly for all links first, then tables of the
-clearances of near links that these leave open; last, the covers of the links that still spoil most proofs are made
-anew, thoroughly, as long as the time lasts.
+clearances of near links that these leave open, and pairs are searched, for which the covers save most checks of meshes.
+Last, the covers of the links that still spoil most proofs are made anew, thoroughly, as long as the time lasts.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from apex_ompl.collision.cover.pairs import PairSearch, disabled_pairs
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.spheres import FULL, make_cover, read_covers, read_efforts, shape_key, write_covers
 from apex_ompl.collision.cover.survey import proved_share
+from apex_ompl.collision.links import Links
 from apex_ompl.robot.config import RobotConfig, read_config, read_disabled_pairs_file
 from apex_ompl.robot.model import Robot, bare_robot, build_robot, digest, link_of
 from apex_ompl.robot.new import pairs_text
@@ -33,7 +34,7 @@ from apex_ompl.util.files import check_writable, read_text, write_atomically
 from apex_ompl.util.validation import check_integer, check_positive
 
 SAMPLES = 500  # states at which it is measured which links spoil proofs
-PAIRS_SHARE = 0.3  # of the budget, for pairs
+QUICK_SHARE, PAIRS_SHARE = 0.5, 0.2  # of the budget, for quick covers at first, and for pairs
 TABLES_SHARE, MOST_FOR_TABLES = 0.5, 60.0  # of the time that is left then, for tables of near links, and most [s]
 COMMAND = "apex-ompl robot prepare"
 
@@ -104,23 +105,29 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
     covers_file = path.parent / (config.covers or f"{stem}.spheres.json")
     for file in (path, pairs_file, covers_file):
         check_writable(file)
-    count, complete = _prepare_pairs(robot, config, pairs_file, settings, report)
-    _name_in(path, {"disabled_pairs": pairs_file})
-    covers = _Covers(robot, covers_file, settings, deadline, report)
-    covers.make(dict.fromkeys(covers.shapes, 1.0), 1)
-    files = [pairs_file, covers_file]
+    covers = _Covers(robot, covers_file, settings, report)
+    covers.make(covers.all, 1, time.monotonic() + QUICK_SHARE * settings.budget)
+    files, links, known = [pairs_file], None, dict[str, str | None]()
     if covers_file.exists():
         _name_in(path, {"covers": covers_file})
-        files += _prepare_tables(path, settings, deadline, report)
+        known = {"covers": str(covers_file), "disabled_pairs": str(pairs_file) if pairs_file.exists() else None}
+        files += [covers_file, *_prepare_tables(build_robot(config.model_copy(update=known), path), deadline, report)]
+    if not covers.missing:
+        links = Links.of(build_robot(config.model_copy(update=known | {"disabled_pairs": None}), path))
+    count, complete = _prepare_pairs(robot, config, pairs_file, settings, report, links=links)
+    _name_in(path, {"disabled_pairs": pairs_file})
+    if covers_file.exists():
+        if covers.missing:
+            covers.make(covers.all, 1, deadline)
         if settings.effort > 1 and time.monotonic() < deadline:
-            covers.make(_weights(path, robot), settings.effort)
+            covers.make(_weights(path, robot), settings.effort, deadline)
     efforts = [covers.efforts.get(key, 0) for key in covers.shapes]
     numbers = {effort: efforts.count(effort) for effort in sorted({*efforts} - {0})}
     thorough = complete and min(efforts, default=FULL) >= settings.effort
-    return Prepared(count, numbers, efforts.count(0), thorough, tuple(files))
+    return Prepared(count, numbers, covers.missing, thorough, tuple(files))
 
 
-def _prepare_tables(path: Path, settings: Preparation, deadline: float, report: Report) -> list[Path]:
+def _prepare_tables(robot: Robot, deadline: float, report: Report) -> list[Path]:
     """Write the tables of clearances of links that the covers leave open, and return their file."""
     stage, seconds = "near links", min(MOST_FOR_TABLES, TABLES_SHARE * (deadline - time.monotonic()))
     if seconds <= 0.0:
@@ -132,13 +139,13 @@ def _prepare_tables(path: Path, settings: Preparation, deadline: float, report: 
         spent += made.seconds
         report(stage, min(1.0, spent / seconds))
 
-    file = prepare_clearances(build_robot(read_config(path), path), seconds, progress)
+    file = prepare_clearances(robot, seconds, progress)
     report(stage, 1.0)
     return [] if file is None else [file]
 
 
 def _prepare_pairs(
-    robot: Robot, config: RobotConfig, file: Path, settings: Preparation, report: Report
+    robot: Robot, config: RobotConfig, file: Path, settings: Preparation, report: Report, *, links: Links | None
 ) -> tuple[int, bool]:
     """Write the file of disabled pairs unless it is this robot's; return the number, and whether all were decided."""
     search, deadline = settings.pairs, time.monotonic() + PAIRS_SHARE * settings.budget
@@ -147,7 +154,7 @@ def _prepare_pairs(
     known = read_disabled_pairs_file(file) if file.exists() else None
     if known is not None and known.command == command and known.robot == digest(robot):
         return len(known.pairs), True
-    found = disabled_pairs(robot, config, search, deadline, lambda share: report("pairs of links", share))
+    found = disabled_pairs(robot, config, search, deadline, lambda share: report("pairs of links", share), links=links)
     complete = time.monotonic() < deadline
     write_atomically(file, pairs_text(found, command if complete else f"{command}, stopped", digest(robot)).encode())
     return len(found), complete
@@ -156,20 +163,30 @@ def _prepare_pairs(
 class _Covers:
     """Covers of the shapes of a robot, and their file."""
 
-    def __init__(self, robot: Robot, file: Path, settings: Preparation, deadline: float, report: Report) -> None:
-        self.file, self.jobs, self.deadline, self.report = file, settings.jobs, deadline, report
+    def __init__(self, robot: Robot, file: Path, settings: Preparation, report: Report) -> None:
+        self.file, self.jobs, self.report = file, settings.jobs, report
         self.shapes = {shape_key(item.geometry): item.geometry for item in robot.geometry.geometryObjects}
         self.covers: dict[str, Cover] = read_covers(file) if file.exists() else {}
         self.efforts = read_efforts(file) if file.exists() else {}
 
-    def make(self, weights: Mapping[str, float], effort: int) -> None:
+    @property
+    def all(self) -> dict[str, float]:
+        """Equal weights of all shapes."""
+        return dict.fromkeys(self.shapes, 1.0)
+
+    @property
+    def missing(self) -> int:
+        """Number of shapes without a cover."""
+        return sum(key not in self.covers for key in self.shapes)
+
+    def make(self, weights: Mapping[str, float], effort: int, deadline: float) -> None:
         """Make the covers that were not made by an effort yet, those of the largest weights first."""
         waiting = [
             key for key in sorted(self.shapes, key=lambda key: (-weights.get(key, 0.0), _size(self.shapes[key])))
         ]
         waiting = [key for key in waiting if self.efforts.get(key, 0) < effort]
         stage = "quick covers" if effort == 1 else "thorough covers"
-        with _made({key: self.shapes[key] for key in waiting}, effort, self.jobs, self.deadline) as made:
+        with _made({key: self.shapes[key] for key in waiting}, effort, self.jobs, deadline) as made:
             for k, (key, cover) in enumerate(made):
                 self.covers[key], self.efforts[key] = cover, effort
                 write_covers(self.file, self.covers, self.efforts)

@@ -21,7 +21,8 @@ from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.collision.shapes import is_shell
 from apex_ompl.errors import ParameterError
-from apex_ompl.scene.meshes import capped, triangles, winding_number
+from apex_ompl.kernel.geometry import BallTree, EnclosingSurface, surface_distances, tree_order
+from apex_ompl.scene.meshes import capped, is_watertight, triangles
 from apex_ompl.types import Array, Flags
 
 FLAT = 1e-6  # points that spread less than this lie in one plane and have no hull [m]
@@ -200,17 +201,13 @@ class Field:
 
     @classmethod
     def over(cls, low: Array, high: Array, skin: Array, contains: Callable[[Array], Flags], count: int) -> Field:
-        """Sample depths at about ``count`` grid points, by distances to points of the surface ``skin``, (N, 3)."""
+        """Sample depths at about ``count`` grid points, by distances to the triangles ``skin``, shape (T, 3, 3) [m]."""
         spacing = float(np.prod(high - low) / count) ** (1 / 3)
         numbers = np.maximum(np.ceil((high - low) / spacing).astype(int), 2)
         lines = [np.linspace(a, b, n + 1) for a, b, n in zip(low, high, numbers, strict=True)]
         grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
-        square = np.empty(len(grid))
-        half = 0.5 * np.einsum("ij,ij->i", skin, skin)
-        for rows in np.array_split(np.arange(len(grid)), max(1, len(grid) * len(skin) // 4_000_000)):
-            dots = half - grid[rows] @ skin.T
-            square[rows] = 2.0 * dots.min(axis=1) + np.einsum("ij,ij->i", grid[rows], grid[rows])
-        depths = np.where(contains(grid), 1.0, -1.0) * np.sqrt(np.maximum(square, 0.0))
+        tree = BallTree.over(np.ascontiguousarray(skin[tree_order(skin.mean(axis=1))]))
+        depths = np.where(contains(grid), 1.0, -1.0) * surface_distances(grid, tree, np.inf)
         return cls(low, (high - low) / numbers, depths.reshape(numbers + 1))
 
     def __call__(self, points: Array) -> Array:
@@ -232,7 +229,7 @@ class Solid:
 
     Attributes:
         parts: The parts.
-        skin: Points on the surface of a solid of several parts, shape (N, 3) [m]; None for a single part.
+        skin: Triangles of the surface of a solid of several parts, shape (T, 3, 3) [m]; None for a single part.
         depths: Number of grid points at which the depth of a solid of several parts is sampled.
     """
 
@@ -317,25 +314,25 @@ def _cells(corners: Array) -> Solid:
         0.5 * (a + b) + size * (np.arange(n + 1) - 0.5 * n + 0.0137) for a, b, n in zip(low, high, counts, strict=True)
     ]
     grid = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
-    within = np.array([abs(winding_number(p, corners)) > 0.5 for p in grid.reshape(-1, 3)]).reshape(grid.shape[:3])
+    surface = EnclosingSurface(np.ascontiguousarray(corners), np.stack([low, high]), is_watertight(corners))
+    within = np.array([surface.encloses(p) for p in grid.reshape(-1, 3)]).reshape(grid.shape[:3])
     triangle_low, triangle_high = corners.min(axis=1), corners.max(axis=1)
     parts: list[Part] = []
     for i, j, k in np.ndindex(*(int(n) for n in counts)):
         start, stop = grid[i, j, k], grid[i + 1, j + 1, k + 1]
         box = np.ix_([i, i + 1], [j, j + 1], [k, k + 1])
-        near = ((triangle_low <= stop) & (triangle_high >= start)).all(axis=1)
-        points = [grid[box].reshape(-1, 3)[within[box].ravel()]]
-        points += [_clip(triangle, start, stop) for triangle in corners[near]]
+        near = np.flatnonzero(((triangle_low <= stop) & (triangle_high >= start)).all(axis=1))
+        inner = ((triangle_low[near] >= start) & (triangle_high[near] <= stop)).all(axis=1)
+        points = [grid[box].reshape(-1, 3)[within[box].ravel()], corners[near[inner]].reshape(-1, 3)]
+        points += [_clip(triangle, start, stop) for triangle in corners[near[~inner]]]
         stacked = np.concatenate(points)
         if len(stacked):
             parts.append(Polytope.around(stacked))
-    return Solid(tuple(parts), triangle_points(corners, size / 3))
+    return Solid(tuple(parts), corners)
 
 
 def _clip(triangle: Array, low: Array, high: Array) -> Array:
     """Return the corners of a triangle, shape (3, 3), clipped to a box, shape (N, 3) (Sutherland, Hodgman 1974)."""
-    if (triangle >= low).all() and (triangle <= high).all():
-        return triangle
     polygon = list(triangle)
     for axis in range(3):
         for sign, bound in ((1.0, high[axis]), (-1.0, -low[axis])):

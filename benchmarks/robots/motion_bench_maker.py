@@ -1,0 +1,113 @@
+"""MotionBenchMaker's problems of the Panda, the UR5 and the Fetch: apex without a model beside rrtconnect+polish.
+
+The problems (Chamzas et al. 2022), URDFs, SRDFs and meshes are those of VAMP's repository, github.com/KavrakiLab/vamp,
+whose folder ``resources`` is given, its ``problems.tar.bz2`` unpacked. Robots are set up by ``apex-ompl robot new``
+from them, the Fetch with its torso, locked joints as at the start of the first problem, and prepared by
+``apex-ompl robot prepare``. Meshes decide. Problems whose start or goal the meshes refuse are left out and counted.
+Those of Baxter are in benchmarks/planners/motion_bench_maker.py. Times and columns are those of
+:mod:`benchmarks.robots.any_robot`; figures are kept in benchmarks/runs/mbm.
+
+Usage: python -m benchmarks.robots.motion_bench_maker RESOURCES [ROBOT...] [-n 100] [--budget 300] [--folder FOLDER]
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import MissingFileError
+from apex_ompl.robot import load_robot
+from apex_ompl.robot.moveit import convert
+from apex_ompl.robot.new import new_robot, sources_of
+from apex_ompl.scene.problem import Problem
+from apex_ompl.util.entry_point import run_script
+from apex_ompl.util.files import read_text, write_atomically
+from apex_ompl.util.schema import dump_yaml, read_yaml
+from apex_ompl.util.validation import check_name
+from benchmarks.lib import record
+from benchmarks.robots import figures
+
+DEPENDS = ("@planning", "benchmarks/robots/figures.py")
+FOLDER = Path(__file__).parents[1] / "runs" / "mbm"
+ROBOTS = ("panda", "ur5", "fetch")
+PACKAGES = {"fetch": "fetch_description"}
+SMALLER = {"fetch": "arm"}  # groups of the SRDF whose joints are part of the group that is planned
+GROUP = r'<group name="{}">.*?</group>'
+
+
+def requests(robot: str, resources: Path) -> list[Path]:
+    """Return the requests of a robot, those of all sets in turn.
+
+    Raises:
+        MissingFileError: There are none.
+    """
+    sets = [sorted(folder.glob("request*.yaml")) for folder in sorted((resources / robot / "problems").glob("*"))]
+    if not any(sets):
+        raise MissingFileError(str(resources / robot / "problems"), "folder of problems", "no requests in it")
+    most = max(map(len, sets))
+    return [some[k] for k in range(most) for some in sets if k < len(some)]
+
+
+def set_up(robot: str, resources: Path, folder: Path) -> Path:
+    """Return the robot file of a robot, which is written where it is missing."""
+    file, here = folder / robot / f"{robot}.robot.yaml", resources / robot
+    if file.exists():
+        return file
+    file.parent.mkdir(parents=True, exist_ok=True)
+    text, srdf = read_text(here / f"{robot}.srdf", "SRDF"), file.parent / f"{robot}.srdf"
+    if robot in SMALLER:
+        text = re.sub(GROUP.format(SMALLER[robot]), "", text, count=1, flags=re.DOTALL)
+    write_atomically(srdf, text.encode())
+    packages = {PACKAGES[robot]: here} if robot in PACKAGES else {}
+    new_robot(sources_of([str(here / f"{robot}.urdf")], [str(srdf)]), file, packages)
+    data = read_yaml(file, "robot file")
+    state = read_yaml(requests(robot, resources)[0], "request")["start_state"]["joint_state"]
+    given = dict(zip(state["name"], state["position"], strict=True))
+    data["locked"] = {joint: given.get(joint, value) for joint, value in data.get("locked", {}).items()}
+    write_atomically(file, dump_yaml(data).encode())
+    return file
+
+
+def problems(robot: Path, resources: Path, most: int) -> Iterator[tuple[str, Problem | None]]:
+    """Yield the names of the first problems of a robot with the problems, None where a start or goal is not free."""
+    loaded = load_robot(robot)
+    name = robot.name.split(".")[0]
+    for request in requests(name, resources)[:most]:
+        scene = request.with_name(request.name.replace("request", "scene"))
+        found = convert(scene, request, loaded).problem.model_copy(update={"robot": str(robot)})
+        checker = CollisionChecker(loaded, found.scene, found.attached, found.allowed)
+        ends = [found.start_state(loaded.joint_names), *found.goal_states(loaded.joint_names)]
+        free = all(checker.is_free(q) and loaded.limit_fault(q) is None for q in ends)
+        yield f"{request.parent.name}/{request.stem}", found if free else None
+
+
+def main() -> None:
+    """Set up, prepare, plan and write."""
+    parser = record.parser(__doc__, n=100, of="problems of a robot")
+    parser.add_argument("resources", type=Path, help="folder resources of VAMP's repository")
+    parser.add_argument("robots", nargs="*", help=f"by default all of {', '.join(ROBOTS)}")
+    figures.add_options(parser, FOLDER)
+    args = parser.parse_args()
+    rows, refused = {}, {}
+    for robot in [check_name(name, "robot", ROBOTS) for name in args.robots or ROBOTS]:
+        file = set_up(robot, args.resources.resolve(), args.folder.resolve())
+        mine = figures.Figures(file)
+        mine.prepare(args.budget, args.jobs)
+        found = cache(lambda file=file: dict(problems(file, args.resources, args.n)))
+        known = mine.data.get("refused", {})
+        if known.get("n", 0) < args.n:
+            mine.write(refused={"n": args.n, "names": [name for name, one in found().items() if one is None]})
+        gone = set(mine.data["refused"]["names"])
+        names = [f"{path.parent.name}/{path.stem}" for path in requests(robot, args.resources)[: args.n]]
+        names, refused[robot] = [name for name in names if name not in gone], len(gone & {*names})
+        mine.run(names, lambda name, found=found: found()[name])
+        rows[robot] = mine, names
+    left = ", ".join(f"{robot} {count}" for robot, count in refused.items())
+    figures.write("motion_bench_maker_robots", rows, budget=args.budget, refused=left)
+
+
+if __name__ == "__main__":
+    run_script(main)
