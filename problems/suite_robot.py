@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
-from apex_ompl.goals.state_sampling import DualArmTables
 from apex_ompl.problems.broad_representation import Group, given
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -20,12 +18,6 @@ MARGIN = 0.01  # clearance of every start and goal [m]
 def robot() -> Robot:
     """Return the robot of the suites."""
     return load_robot(ROBOT)
-
-
-@cache
-def empty_hand_tables() -> DualArmTables:
-    """Return the kernel's tables of the robot with empty hands."""
-    return DualArmTables.of(robot())
 
 
 @dataclass(frozen=True, eq=False)
