@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from apex_ompl.constraints.links import Links
 from apex_ompl.errors import SceneError
 from apex_ompl.goals.grasp import grasp
-from apex_ompl.goals.state_sampling import ArmTables, HandPoseSampler, HandRegion, Region, has_clearance
+from apex_ompl.goals.state_sampling import ArmTables, HandPoseSampler, HandRegion, Region
 from apex_ompl.kernel import Kernel, RobotTables, SceneTables
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of
 from apex_ompl.paths.candidates import first_valid
@@ -78,7 +78,7 @@ class Held:
     ) -> Held:
         """Return held objects with the tables of the robot that holds them, by default that of the suites."""
         cell = cell or standard_cell()
-        tables = ArmTables.of(cell.robot, attached) if attached else cell.tables
+        tables = cell.holding(attached) if attached else cell.tables
         return cls(cell, tuple(attached), tables, np.array(low, float), np.array(high, float))
 
 
@@ -276,7 +276,8 @@ class EndSampler:
         return None
 
     def _joints(self, rng: np.random.Generator, *, rest: bool) -> Array | None:
-        some, hands = self._cell.robot, self._held.tables.synergies
+        some, tables = self._cell.robot, self._held.tables
+        hands = tables.synergies
         states = rng.uniform(some.limits.lower, some.limits.upper, (BATCH, some.dof))
         if rest:
             states[:] = some.home + rng.normal(0.0, REST_SPREAD, (BATCH, some.dof))
@@ -284,7 +285,9 @@ class EndSampler:
         states[:] = np.round(np.clip(states, some.limits.lower, some.limits.upper), 6)
         states = states[[some.limit_fault(q) is None for q in states]]
         for scene in self._scenes:
-            clear = np.flatnonzero(has_clearance(Kernel(self._held.tables.whole, scene), states, self._margin))
+            clear = np.flatnonzero(
+                self._held.tables.are_clear(Kernel(self._held.tables.whole, scene), states, self._margin)
+            )
             if len(clear):
                 return np.array(states[clear[0]])
         return None

@@ -7,6 +7,7 @@ arms, so that they are before the arms' bases in the direction of their tips at 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
@@ -22,7 +23,7 @@ from apex_ompl.problems.broad_representation import obstacles, part_of
 from apex_ompl.problems.scenes import DOWN, FORWARD
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import Obstacle
+from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.types import Array
 from apex_ompl.util.cache import weakly_cached
 
@@ -86,7 +87,11 @@ class Cell:
     @cached_property
     def tables(self) -> ArmTables:
         """The kernel's tables of the robot with empty hands."""
-        return ArmTables.of(self.robot)
+        return self.holding(())
+
+    def holding(self, attached: Sequence[AttachedObject]) -> ArmTables:
+        """Return the kernel's tables of the robot with held objects."""
+        return ArmTables.of(self.robot, attached, own_margin=self.pose is None)
 
     @cached_property
     def fixtures(self) -> tuple[Solids, ...]:

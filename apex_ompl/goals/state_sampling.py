@@ -102,6 +102,7 @@ class ArmTables:
         alone: Tables that check one arm with its hand, and ignore the bodies of the others, for each arm.
         others: Indices of the planned joints that belong to no arm, such as a torso's.
         synergies: Indices of the joints that close the hands.
+        own_margin: Whether bodies of the robot keep a margin from one another, too; else they are proved apart.
     """
 
     robot: Robot
@@ -110,10 +111,16 @@ class ArmTables:
     alone: tuple[RobotTables, ...]
     others: tuple[int, ...]
     synergies: tuple[int, ...]
+    own_margin: bool
 
     @classmethod
-    def of(cls, robot: Robot, attached: Sequence[AttachedObject] = ()) -> ArmTables:
+    def of(cls, robot: Robot, attached: Sequence[AttachedObject] = (), *, own_margin: bool) -> ArmTables:
         """Return the tables of a robot and the objects that it holds.
+
+        Args:
+            robot: The robot.
+            attached: The objects.
+            own_margin: Whether bodies of the robot keep a margin from one another.
 
         Raises:
             RobotError: The robot has no arms.
@@ -124,7 +131,22 @@ class ArmTables:
         alone = tuple(whole.restricted_to((*arm.joints, *others)) for arm in arms)
         names = (robot.hands[arm.hand].synergy for arm in arms if arm.hand is not None)
         synergies = tuple(robot.joint_names.index(name) for name in names if name is not None)
-        return cls(robot, arms, whole, alone, others, synergies)
+        return cls(robot, arms, whole, alone, others, synergies, own_margin)
+
+    def are_clear(self, kernel: Kernel, states: Array, margin: float) -> NDArray[np.bool_]:
+        """Whether states keep a margin to the scene and, where ``own_margin``, between bodies of the robot.
+
+        Args:
+            kernel: Some of the tables in a scene.
+            states: Shape (N, dof).
+            margin: [m].
+
+        Returns:
+            Shape (N,).
+        """
+        if self.own_margin or not len(states):
+            return has_clearance(kernel, states, margin)
+        return np.asarray((kernel.clearance(states, margin)[:, 0] >= margin) & (kernel.unproved(states)[1] == 0))
 
 
 class HandPoseSampler:
@@ -168,18 +190,22 @@ class HandPoseSampler:
         """
         others = self._tables.others
         for _ in range(attempts):
-            rest = self.robot.home + rng.normal(0.0, OTHERS_SPREAD, self.robot.dof) if others else self.robot.home
-            rest = np.round(np.clip(rest, self.robot.limits.lower, self.robot.limits.upper), 6)
+            rest = self._rest(rng) if others else self.robot.home
             found = [self._sample_arm(rng, arm, region, synergies, rest) for arm, region in enumerate(regions)]
             if not all(map(len, found)):
                 continue
-            states: Array = found[0]
+            states = found[0]
             for arm, own in zip(self._tables.arms[1:], found[1:], strict=True):
                 states = _combined(states, own, arm)
-            clear = np.flatnonzero(has_clearance(self._kernel, states, self.margin))
+            clear = np.flatnonzero(self._tables.are_clear(self._kernel, states, self.margin))
             if len(clear):
                 return np.array(states[clear[0]])
         return None
+
+    def _rest(self, rng: np.random.Generator) -> Array:
+        """Return a state around home, shape (dof,)."""
+        limits, spread = self.robot.limits, rng.normal(0.0, OTHERS_SPREAD, self.robot.dof)
+        return np.asarray(np.round(np.clip(self.robot.home + spread, limits.lower, limits.upper), 6))
 
     def _sample_arm(
         self, rng: np.random.Generator, number: int, region: Region, synergies: Synergies, rest: Array
@@ -209,7 +235,8 @@ class HandPoseSampler:
         reached = reached[[self.robot.limit_fault(q) is None for q in reached]]
         if not len(reached):
             return reached
-        return np.array(reached[has_clearance(self._arm_kernels[number], reached, self.margin)][:MAX_ARM_STATES])
+        clear = tables.are_clear(self._arm_kernels[number], reached, self.margin)
+        return np.array(reached[clear][:MAX_ARM_STATES])
 
 
 def _combined(states: Array, own: Array, arm: Arm) -> Array:
