@@ -63,6 +63,16 @@ def find_model(robot: Robot) -> FoundModel:
     return FoundModel(NONE, note)
 
 
+def model_notes(robot: Robot) -> list[str]:
+    """Return a sentence where there is no model for a robot, else none.
+
+    Raises:
+        ApexError: As :func:`find_model`.
+    """
+    found = find_model(robot)
+    return [f"{found.note}, so random perturbations take the place of proposals"] if found.name == NONE else []
+
+
 def robot_fault(name: str | os.PathLike[str], robot: Robot) -> FileFormatError | None:
     """Return the error of a checkpoint that is of another robot, or None.
 

@@ -209,7 +209,7 @@ class MotionPlanner:
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
         with unforked():
-            from apex_ompl.apex.model_search import NONE, find_model
+            from apex_ompl.apex.model_search import model_notes
             from apex_ompl.apex.parameters import NAME
             from apex_ompl.collision.conservative import CheckCounts
             from apex_ompl.ompl.process import Interrupt, quiet_ompl
@@ -229,9 +229,7 @@ class MotionPlanner:
             preparing.enter_context(unforked())
             notes = snapshot_notes(changing) if options.snapshot else []
             if planner is None and self.model is None and "model" not in (options.params or {}):
-                found = find_model(robot)
-                if found.name == NONE:
-                    notes.append(f"{found.note}, so random perturbations take the place of proposals")
+                notes += model_notes(robot)
             parameters = planners.chosen(
                 NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
             )

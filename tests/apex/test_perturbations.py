@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from planning import HARD, cached_problem
 from support import ROOT
 
-from apex_ompl import plan, run
+from apex_ompl import load_robot, plan, run
 from apex_ompl.apex.models import PerturbationModel, make_query, trajectory_model
 from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
