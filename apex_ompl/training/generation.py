@@ -6,7 +6,7 @@ import math
 import platform
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,7 +113,7 @@ def generate(folder: Path, work: Work, settings: Generation, report: Report = la
     return Generated(paths, seconds, total)
 
 
-def _solved(solve: Solve, units: Mapping[str, Any], settings: Generation) -> Iterator[Solved]:
+def _solved(solve: Solve, units: Mapping[str, Any], settings: Generation) -> Generator[Solved]:
     """Yield name, paths and times of units as they are solved."""
     options, spline = settings.options, settings.spline
     if not units or (settings.workers == 1 and settings.address is None):
@@ -126,7 +126,7 @@ def _solved(solve: Solve, units: Mapping[str, Any], settings: Generation) -> Ite
 
 
 def _write_units(
-    store: Store, source: Iterator[Solved], settings: Generation, report: Report
+    store: Store, source: Generator[Solved], settings: Generation, report: Report
 ) -> tuple[int, float]:  # fmt: skip
     """Write the units, and note the run in the manifest; return the number of paths, and the time [s]."""
     started, done, paths, times = time.perf_counter(), 0, 0, Counter[str]()
@@ -141,10 +141,15 @@ def _write_units(
             if seconds >= settings.seconds:
                 break
     finally:
-        source.close()  # type: ignore[attr-defined] - a generator, whose workers end
+        source.close()
         seconds = time.perf_counter() - started
         if done:
-            run = {"workers": settings.workers, "seconds": round(seconds, 1), "units": done, "paths": paths}
+            run: dict[str, Any] = {
+                "workers": settings.workers,
+                "seconds": round(seconds, 1),
+                "units": done,
+                "paths": paths,
+            }
             run["worker_seconds"] = {stage: round(value, 1) for stage, value in sorted(times.items())}
             store.note(runs=[*store.manifest.get("runs", []), run])
     return paths, max(seconds, 1e-9)
