@@ -59,6 +59,7 @@ class Generation:
         workers: Processes; several are run by Ray.
         address: Address of a Ray cluster; None for this machine.
         seconds: Time after which no more units are stored [s].
+        least: Number of paths, and of units, of which one must be reached before.
     """
 
     options: EngineOptions = EngineOptions()
@@ -66,6 +67,7 @@ class Generation:
     workers: int = 1
     address: str | None = None
     seconds: float = math.inf
+    least: tuple[int, int] = (0, 0)
 
 
 class Generated(NamedTuple):
@@ -138,7 +140,8 @@ def _write_units(
             times.update(spent)
             seconds = time.perf_counter() - started
             report(name, paths, seconds)
-            if seconds >= settings.seconds:
+            enough = paths >= settings.least[0] or done >= settings.least[1]
+            if seconds >= settings.seconds and enough:
                 break
     finally:
         source.close()

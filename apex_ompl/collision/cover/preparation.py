@@ -105,12 +105,12 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
     for file in (path, pairs_file, covers_file):
         check_writable(file)
     count, complete = _prepare_pairs(robot, config, pairs_file, settings, report)
-    _name_in(path, {"disabled_pairs": pairs_file})
+    name_in(path, {"disabled_pairs": pairs_file})
     covers = _Covers(robot, covers_file, settings, deadline, report)
     covers.make(dict.fromkeys(covers.shapes, 1.0), 1)
     files = [pairs_file, covers_file]
     if covers_file.exists():
-        _name_in(path, {"covers": covers_file})
+        name_in(path, {"covers": covers_file})
         files += _prepare_tables(path, settings, deadline, report)
         if settings.effort > 1 and time.monotonic() < deadline:
             covers.make(_weights(path, robot), settings.effort)
@@ -234,7 +234,7 @@ def _weights(path: Path, robot: Robot) -> dict[str, float]:
     return weights
 
 
-def _name_in(path: Path, files: Mapping[str, Path]) -> None:
+def name_in(path: Path, files: Mapping[str, Path]) -> None:
     """Add lines to a robot file that name files beside it, where it does not name them; the rest stays as it is."""
     config = read_config(path)
     lines = [f"{key}: {file.name}" for key, file in files.items() if getattr(config, key) is None]
