@@ -135,7 +135,7 @@ def train_robot(
         folder = folder or file.parent / f"{stem}.training"
         check_writable(file)
     check_writable(make_folder(folder, "folder of a training") / STATE)
-    check_writable(make_folder(model.parent, "folder for a checkpoint") / model.name)
+    make_folder(model.parent, "folder for a checkpoint")
     cell_of(robot)  # or it has no arms
     states = robot.random_state(np.random.default_rng(0), FREE_SAMPLES)
     if not CollisionChecker(robot).are_free(states).any():
