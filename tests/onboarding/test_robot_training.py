@@ -43,7 +43,7 @@ def test_a_urdf_becomes_a_robot_with_a_model(apex_cli, tmp_path: Path, monkeypat
     for _ in range(3):
         with pytest.raises(KeyboardInterrupt):
             train_robot("toy.robot.yaml", None, Session(0.0005), interrupt)
-    print("STAGES", stages)
+    assert stages[:2] == ["data"] * 2 and stages.index("training") < stages.index("validation")
     done = apex_cli(*train)
     assert done.returncode == 0 and "too few problems to tell" in done.stdout, done.stderr
     robot = load_robot("toy.robot.yaml")
