@@ -2,7 +2,7 @@
 
 Scenes are drawn in the frame of the two Pandas' cell: their bases are at y = 0.5 m and y = -0.5 m, their front is x,
 and what stands stands on z = 0. For another robot a similarity transform moves and scales them: by the reach of its
-arms, so that they are before the arms' bases in the direction of their tips at home.
+arms, so that they are before the arms' bases in the direction of their tips at home, or of x where these disagree.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ HANGING = 1.0  # the same of arms that hang [m]
 AHEAD = 0.5  # distance of the middle of a tip's wide region from the base of the arm [m]
 INWARD = 0.3  # share of the way to the middle of all such regions by which each is moved
 SHOULDER = 0.35  # height of the middle of what an arm reaches [m]
+AGREED = 0.7  # cosine of the angle between directions that agree
 LEVEL = 0.1  # of the reach, below which a horizontal distance gives no direction
 
 
@@ -70,7 +71,7 @@ class Cell:
         """
         arms = arms_of(robot)
         size = float(np.mean([arm.reach for arm in arms])) / REACH
-        fronts = [_front(arm) for arm in arms]
+        fronts = _fronts(arms)
         middles = np.array([arm.base + AHEAD * size * front for arm, front in zip(arms, fronts, strict=True)])
         bases, middle = np.mean([arm.base for arm in arms], axis=0), middles.mean(axis=0)
         front = middle - bases
@@ -144,11 +145,20 @@ class _Moved:
         return self.pose[:3, :3] @ (self.size * point) + self.pose[:3, 3], (x, y, z)
 
 
-def _front(arm: Arm) -> Array:
-    """Return the horizontal unit direction from the base of an arm to its tip at home; x where there is none."""
-    way = (arm.tip - arm.base) * (1.0, 1.0, 0.0)
-    length = np.linalg.norm(way)
-    return np.asarray(way / length if length > LEVEL * arm.reach else np.eye(3)[0])
+def _fronts(arms: Sequence[Arm]) -> list[Array]:
+    """Return the horizontal unit direction in which each arm works.
+
+    It is that of its tip at home where all of them agree, or where each points to the middle of the arms; else x.
+    """
+    found, middle = list[Array](), np.mean([arm.base for arm in arms], axis=0)
+    for arm in arms:
+        way = (arm.tip - arm.base) * (1.0, 1.0, 0.0)
+        length = np.linalg.norm(way)
+        found.append(np.asarray(way / length if length > LEVEL * arm.reach else np.eye(3)[0]))
+    agree = np.linalg.norm(np.mean(found, axis=0)) > AGREED
+    inward = [(middle - arm.base) @ front > AGREED * np.linalg.norm(middle - arm.base)
+              for arm, front in zip(arms, found, strict=True)]  # fmt: skip
+    return found if agree or all(inward) else [np.eye(3)[0]] * len(arms)
 
 
 @cache
