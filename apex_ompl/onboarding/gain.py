@@ -1,8 +1,8 @@
 """What the proposals of a model gain: plans with and without the model on validation problems, in the same time.
 
 Both plans of a problem have the same seed and time limit; the order changes from problem to problem, and the scene is
-loaded before. Where trees find all paths before proposals are drawn, there is no gain whatever the times are. Apex without a
-model takes random perturbations of straight lines in the place of proposals.
+loaded before. Where trees find all paths before proposals are drawn, there is no gain whatever the times are. Apex
+without a model takes random perturbations of straight lines in the place of proposals.
 """
 
 from __future__ import annotations
@@ -114,9 +114,10 @@ def summary(found: Sequence[Pair], timeout: float) -> dict[str, Any]:
         "stages": {stage: stages.count(stage) for stage in sorted(set(stages))},
     }  # fmt: skip
     told = {key: _finite(value) for key, value in numbers.items()}
-    if stages and set(stages) == {TREES}:
-        return told | {"verdict": "no gain: trees found all paths before proposals were drawn"}
-    return told | {"verdict": _verdict(len(found), solved, interval)}
+    verdict = _verdict(len(found), solved, interval)
+    if set(stages) == {TREES} and len(found) >= ENOUGH:
+        verdict = "no gain: trees found all paths before proposals were drawn"
+    return told | {"verdict": verdict}
 
 
 def _finite(value: Any) -> Any:

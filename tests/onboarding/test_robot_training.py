@@ -137,4 +137,6 @@ def test_a_gain_is_told_where_the_times_show_it() -> None:
     rows = [Pair("p", (True, True), (a, b), "") for a, b in ((1.0, 1.2), (1.2, 1.0)) * 12]
     assert gain.summary(rows, 2.0)["verdict"].startswith("no gain")
     assert same["solved"] == [40, 40] and same["stages"] == {"proposals": 40}
+    trees = [row._replace(stage="sprint", seconds=(0.1, 0.2)) for row in rows]
+    assert gain.summary(trees, 2.0)["verdict"].startswith("no gain: trees found all")
     assert gain.summary([], 2.0)["ratio"] is None
