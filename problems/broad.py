@@ -34,13 +34,13 @@ from apex_ompl.problems.broad_tasks import (
     clear_parts,
     difficulty,
     draw_held,
-    palm_line,
     scene_of,
-    wide_region,
+    tips_on_line,
 )
 from apex_ompl.problems.broad_unseen import STRANGERS
 from apex_ompl.problems.objects import primitive
-from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, empty_hand_tables, robot
+from apex_ompl.problems.robot_cells import Cell, standard_cell
+from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.types import Array
 
@@ -63,14 +63,18 @@ LOW, HIGH = np.array([-0.4, -1.3, 0.0]), np.array([1.25, 1.3, 1.5])  # parts out
 LEAST_MOTION = 0.4  # of some joint from start to goal [rad]
 
 
-def draw_simple(rng: np.random.Generator, level: str, synergies: Interval) -> DrawnProblem | None:
+def draw_simple(
+    rng: np.random.Generator, level: str, synergies: Interval, cell: Cell | None = None
+) -> DrawnProblem | None:  # fmt: skip
     """Draw a problem; None when this draw has no start or no goal.
 
     Args:
         rng: Source of everything.
-        level: One of ``SIMPLE_LEVELS``.
+        level: One of ``SIMPLE_LEVELS``; ``alignment`` is for the robot of the suites alone.
         synergies: Interval of the synergies of empty hands.
+        cell: The robot's cell, by default that of the suites.
     """
+    cell = cell or standard_cell()
     attached: tuple[AttachedObject, ...] = ()
     if level == "alignment":
         suite = sorted(alignment.SAMPLERS)[int(rng.integers(len(alignment.SAMPLERS)))]
@@ -80,19 +84,20 @@ def draw_simple(rng: np.random.Generator, level: str, synergies: Interval) -> Dr
         ends, attached = np.stack([bare.start, bare.goal]), bare.attached
         tables = next(s().tables for s in alignment.SAMPLERS[suite] if s().attached == attached)
     else:
-        tables = empty_hand_tables().both
-        poses = HandPoseSampler(empty_hand_tables(), (), MARGIN)
-        found = [poses.sample(rng, (wide_region(0), wide_region(1)), synergies) for _ in range(2)]
+        tables = cell.tables.whole
+        poses = HandPoseSampler(cell.tables, (), MARGIN)
+        regions = [cell.wide_region(arm) for arm in range(len(cell.arms))]
+        found = [poses.sample(rng, regions, synergies) for _ in range(2)]
         if found[0] is None or found[1] is None:
             return None
         ends = np.stack([q for q in found if q is not None])
-    scene = _draw_obstacles(rng, tables, ends)
+    scene = _draw_obstacles(rng, cell, tables, ends)
     return DrawnProblem(scene, ends[0], ends[1], attached)
 
 
-def _draw_obstacles(rng: np.random.Generator, tables: RobotTables, ends: Array) -> tuple[Obstacle, ...]:
+def _draw_obstacles(rng: np.random.Generator, cell: Cell, tables: RobotTables, ends: Array) -> tuple[Obstacle, ...]:
     """Return obstacles that keep ``MARGIN`` to the robot at start and goal, ``ends`` of shape (2, dof)."""
-    palms = palm_line(tables, ends, LINE_STATES).reshape(-1, 3)
+    palms = tips_on_line(cell, tables, ends, LINE_STATES)
     scene: list[Obstacle] = []
     for k in range(int(rng.integers(MAX_OBSTACLES + 1))):
         for _ in range(ATTEMPTS):
@@ -102,8 +107,8 @@ def _draw_obstacles(rng: np.random.Generator, tables: RobotTables, ends: Array) 
             size, quaternion = rng.uniform(*SIMPLE_SIZE, 3), rng.normal(size=4)
             kind = int(rng.integers(4))
             # Data sets refer to problems by their content, these names included.
-            obstacle = primitive(f"thing_{k}", kind, size, np.maximum(center, SIMPLE_LOW), quaternion)
-            if (scene_kernel(robot(), tables, [obstacle]).clearance(ends, MARGIN)[:, 0] >= MARGIN).all():
+            obstacle = cell.obstacle(primitive(f"thing_{k}", kind, size, np.maximum(center, SIMPLE_LOW), quaternion))
+            if (scene_kernel(cell.robot, tables, [obstacle]).clearance(ends, MARGIN)[:, 0] >= MARGIN).all():
                 scene.append(obstacle)
                 break
     return tuple(scene)
@@ -122,7 +127,7 @@ class Candidate:
     """A problem before its difficulty is known.
 
     Attributes:
-        parts: The parts.
+        parts: The parts, in the world.
         ends: Start and goal, shape (2, dof).
         held: What the hands hold.
         representation: How the parts are given.
@@ -134,15 +139,22 @@ class Candidate:
     representation: Representation
 
 
-def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | None:
-    """Draw a problem of a suite and level; None when no draw has a start and a goal."""
+def draw(rng: np.random.Generator, suite: str, level: str, cell: Cell | None = None) -> DrawnProblem | None:
+    """Draw a problem of a suite and level; None when no draw has a start and a goal.
+
+    Args:
+        rng: Source of everything.
+        suite: ``broad`` or ``unseen``.
+        level: One of its grammars.
+        cell: The robot's cell, by default that of the suites.
+    """
     wanted, best, hardest = int(rng.choice(len(WANTED), p=WANTED)), None, -1
-    held = draw_held(rng)  # once, as tables of the robot that holds something take longest
+    held = draw_held(rng, cell)  # once, as tables of the robot that holds something take longest
     for _ in range(TRIES):
         found = _candidate(rng, suite, GRAMMARS[suite][level], held)
         if found is None:
             continue
-        kernel = Kernel(found.held.tables.both, scene_of(found.parts, found.representation.swelling))
+        kernel = Kernel(found.held.tables.whole, scene_of(found.parts, found.representation.swelling, held.cell))
         measured = difficulty(kernel, found.ends, rng, wanted)
         if measured > hardest:
             best, hardest = found, measured
@@ -156,19 +168,19 @@ def draw(rng: np.random.Generator, suite: str, level: str) -> DrawnProblem | Non
 
 
 def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Held) -> Candidate | None:
-    representation = draw_representation(rng)
+    representation, cell = draw_representation(rng), held.cell
     margin = MARGIN + ROUNDING + representation.swelling
     scene = composition(rng, suite, grammar)
     way = rng.random()
-    if suite == SUITE and way < ALIGNED:
+    if suite == SUITE and way < ALIGNED and cell is standard_cell():
         held, ends = _aligned(rng)
     else:
         sent = way >= ALIGNED + MET
-        sampler = EndSampler(held, scene.parts if sent else (), scene.places if sent else (), margin)
+        sampler = EndSampler(held, cell.outward(scene.parts) if sent else (), scene.places if sent else (), margin)
         ends = _ends(rng, sampler)
     if ends is None or np.abs(ends[0] - ends[1]).max() < LEAST_MOTION:
         return None
-    palms = palm_line(held.tables.both, ends, 9).reshape(-1, 3)
+    palms = tips_on_line(cell, held.tables.whole, ends, 9)
     if way < ALIGNED + MET:
         scene = in_the_way(rng, scene, palms)
     parts = scene.parts
@@ -176,7 +188,7 @@ def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Hel
         for _ in range(int(rng.integers(1, MOST_LOOSE + 1))):
             center = palms[int(rng.integers(len(palms)))] + rng.normal(0.0, 0.18, 3)
             parts = [*parts, *place(solid(rng, 0.015, 0.2), shift(*center))]
-    parts = clear_parts(held.tables.both, near(parts)[:MOST_OBSTACLES], ends, margin)
+    parts = clear_parts(cell, held.tables.whole, cell.outward(near(parts)[:MOST_OBSTACLES]), ends, margin)
     return Candidate(parts, ends, held, representation)
 
 

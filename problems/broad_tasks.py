@@ -23,13 +23,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.shapes import world_geometry
-from apex_ompl.collision.tables import primitives
 from apex_ompl.constraints.links import Links
 from apex_ompl.errors import SceneError
 from apex_ompl.goals.grasp import grasp
-from apex_ompl.goals.state_sampling import DualArmTables, HandPoseSampler, HandRegion, has_clearance
+from apex_ompl.goals.state_sampling import ArmTables, HandPoseSampler, HandRegion, Region
 from apex_ompl.kernel import Kernel, RobotTables, SceneTables
 from apex_ompl.kernel.scene_builder import Solids, boxes_around, tables_of
 from apex_ompl.paths.candidates import first_valid
@@ -37,17 +34,15 @@ from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import FINE_RESOLUTION, SEARCH_RESOLUTION
 from apex_ompl.problems.broad_parts import Part, Place, kernel_columns
 from apex_ompl.problems.objects import ALONG_X, PALM, cup
-from apex_ompl.problems.scenes import DOWN, FORWARD
-from apex_ompl.problems.suite_robot import empty_hand_tables, robot
+from apex_ompl.problems.robot_cells import FINGERS, Cell, standard_cell
+from apex_ompl.problems.suite_robot import robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.types import Array
 
 NONE_HELD, ONE_HELD = 0.45, 0.3  # shares of problems with empty hands, and with an object in one
 OPEN = (0.0, 0.4)  # interval of the synergies of empty hands
 SYNERGY_STEP = 1e-3
-FINGERS = (DOWN, FORWARD, (0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0))
-SHOULDERS = (0.5, -0.5)  # y of the arms [m]
-REACH = 0.78  # of a place that a hand is sent to, from the axis of its arm [m]
+HELD_SIZE = (0.03, 0.14)  # edges of boxes in hands that do not close, in the cell's frame
 PLACE_WIDTH = 0.02  # half the width of the region around a place [m]
 PLACED, RESTING = 0.7, 0.07  # share of hands that are sent to places, and of states at rest
 CONTORTED = 0.13  # share of states that are drawn evenly from the limits
@@ -64,32 +59,36 @@ class Held:
     """Held objects, and the robot with them.
 
     Attributes:
+        cell: The robot's cell.
         attached: The objects.
-        tables: The kernel's tables of the robot with the objects: of both arms, and of each alone.
-        low: Least synergy of each hand, shape (2,).
-        high: Largest one, the same for a hand that holds something, shape (2,).
+        tables: The kernel's tables of the robot with the objects.
+        low: Least synergy of each hand that closes.
+        high: Largest one, the same for a hand that holds something.
     """
 
+    cell: Cell
     attached: tuple[AttachedObject, ...]
-    tables: DualArmTables
+    tables: ArmTables
     low: Array
     high: Array
 
     @classmethod
-    def of(cls, attached: Sequence[AttachedObject], low: Sequence[float], high: Sequence[float]) -> Held:
-        """Return held objects with the tables of the robot that holds them."""
-        bare = empty_hand_tables()
-        tables = bare
-        if attached:
-            both = CollisionChecker(robot(), (), attached).kernel.robot
-            tables = DualArmTables(
-                bare.robot, both, (both.restricted_to(bare.joints[0]), both.restricted_to(bare.joints[1])), bare.joints
-            )
-        return cls(tuple(attached), tables, np.array(low, float), np.array(high, float))
+    def of(
+        cls, attached: Sequence[AttachedObject], low: Sequence[float], high: Sequence[float], cell: Cell | None = None
+    ) -> Held:
+        """Return held objects with the tables of the robot that holds them, by default that of the suites."""
+        cell = cell or standard_cell()
+        tables = cell.holding(attached) if attached else cell.tables
+        return cls(cell, tuple(attached), tables, np.array(low, float), np.array(high, float))
 
 
-def draw_held(rng: np.random.Generator) -> Held:
-    """Draw what both hands hold: nothing in about half of the problems, else an object in one hand or in both."""
+def draw_held(rng: np.random.Generator, cell: Cell | None = None) -> Held:
+    """Draw what the hands hold: nothing in about half of the problems, else an object in one hand or in two.
+
+    The hands of the robot of the suites, the default, close on objects of many kinds; other hands hold boxes.
+    """
+    if cell is not None and cell is not standard_cell():
+        return _held_boxes(rng, cell)
     share = rng.random()
     sides = (0, 1) if share >= NONE_HELD + ONE_HELD else (int(rng.integers(2)),) if share >= NONE_HELD else ()
     attached, low, high = list[AttachedObject](), [OPEN[0]] * 2, [OPEN[1]] * 2
@@ -100,6 +99,20 @@ def draw_held(rng: np.random.Generator) -> Held:
         if bodies:
             low[side] = high[side] = synergy
     return Held.of(attached, low, high)
+
+
+def _held_boxes(rng: np.random.Generator, cell: Cell) -> Held:
+    """Draw boxes at the grasp points of some of the hands of a cell, half of each beyond the tips of the fingers."""
+    share, robot = rng.random(), cell.robot
+    hands = [arm.hand for arm in cell.arms if arm.hand is not None]
+    count = 0 if share < NONE_HELD else 1 if share < NONE_HELD + ONE_HELD else 2
+    attached = []
+    for number in rng.permutation(len(hands))[:count].tolist():
+        hand = robot.hands[hands[number]]
+        x, y, z = np.round(cell.size * rng.uniform(*HELD_SIZE, 3), 4).tolist()
+        attached.append(AttachedObject(name=f"held_{number}", link=hand.palm, box=(x, y, z), position=hand.point))
+    closing = len(cell.tables.synergies)
+    return Held.of(attached, (OPEN[0],) * closing, (OPEN[1],) * closing, cell)
 
 
 @lru_cache(maxsize=256)
@@ -181,19 +194,15 @@ KINDS: dict[str, Callable[[float, float, float, float], list[dict[str, Any]]]] =
 """Kinds of objects: the fields of their bodies for four numbers from 0 to 1."""
 
 
-@cache
-def _fixtures() -> tuple[Solids, ...]:
-    return tuple(Solids.of(primitives(*world_geometry(body))) for body in robot().fixtures)
-
-
-def scene_of(parts: Sequence[Part], swelling: float = 0.0) -> SceneTables:
-    """Return the kernel's scene of the robot's fixtures, followed by parts.
+def scene_of(parts: Sequence[Part], swelling: float = 0.0, cell: Cell | None = None) -> SceneTables:
+    """Return the kernel's scene of a robot's fixtures, followed by parts.
 
     Args:
-        parts: The parts.
+        parts: The parts, in the world.
         swelling: By how much every part is thicker on each side [m].
+        cell: The robot's cell, by default that of the suites.
     """
-    found = dict(enumerate(_fixtures()))
+    found = dict(enumerate((cell or standard_cell()).fixtures))
     kind, rotation, offset, size = kernel_columns(parts, swelling)
     around = boxes_around(kind, rotation, offset, size) if parts else np.empty((0, 2, 3))
     exact = np.array([swelling == 0.0], np.int64)
@@ -203,18 +212,19 @@ def scene_of(parts: Sequence[Part], swelling: float = 0.0) -> SceneTables:
     return tables_of(found)
 
 
-def clear_parts(tables: RobotTables, parts: list[Part], ends: Array, margin: float) -> list[Part]:
+def clear_parts(cell: Cell, tables: RobotTables, parts: list[Part], ends: Array, margin: float) -> list[Part]:
     """Return those parts that keep a margin to the robot at some states.
 
     Args:
+        cell: The robot's cell.
         tables: The robot with its held objects.
-        parts: The parts.
+        parts: The parts, in the world.
         ends: Shape (n, dof).
         margin: [m].
     """
-    fixtures = len(_fixtures())
+    fixtures = len(cell.fixtures)
     while parts:
-        found, counts = Kernel(tables, scene_of(parts, margin)).unproved(ends)
+        found, counts = Kernel(tables, scene_of(parts, margin, cell)).unproved(ends)
         rows = np.concatenate([some[: max(n, 0), 1] for some, n in zip(found, counts, strict=True)])
         touching: NDArray[np.int64] = np.unique(-1 - rows[rows < -fixtures]) - fixtures
         if not len(touching):
@@ -224,37 +234,39 @@ def clear_parts(tables: RobotTables, parts: list[Part], ends: Array, margin: flo
     return parts
 
 
-def palm_line(tables: RobotTables, ends: Array, count: int) -> Array:
-    """Return the grasp points of both hands at states between start and goal, shape (2, count, 3) [m]."""
-    links = Links.of(robot())
-    points = [links.point(hand.palm, hand.point) for hand in robot().hands.values()]
+def tips_on_line(cell: Cell, tables: RobotTables, ends: Array, count: int) -> Array:
+    """Return the tips of all arms at states between start and goal, in the cell's frame: shape (arms * count, 3)."""
+    links = Links.of(cell.robot)
+    points = [links.point(arm.link, arm.point) for arm in cell.arms]
     states = np.linspace(ends[0], ends[1], count + 2)[1:-1]
-    rotation, origin = Kernel(tables, scene_of(())).joint_frames(states)
-    return np.stack([rotation[:, p.joint] @ np.asarray(p.vector) + origin[:, p.joint] for p in points])
-
-
-def wide_region(side: int) -> HandRegion:
-    """Return the region of the hand of an arm, 0 or 1: over its own table and half of the other one."""
-    middle = 0.7 * SHOULDERS[side]
-    return HandRegion((0.25, 0.75), (middle - 0.5, middle + 0.5), (0.1, 0.8), FINGERS)
+    rotation, origin = Kernel(tables, scene_of((), cell=cell)).joint_frames(states)
+    tips = [rotation[:, p.joint] @ np.asarray(p.vector) + origin[:, p.joint] for p in points]
+    return cell.inward(np.concatenate(tips))
 
 
 class EndSampler:
-    """Sampler of starts and goals among parts, by hands in places and by joints."""
+    """Sampler of starts and goals among parts, by tips in places and by joints."""
 
     def __init__(self, held: Held, parts: Sequence[Part], places: Sequence[Place], margin: float) -> None:
-        """Sample states that keep ``margin`` [m] to ``parts``, or else to the fixtures alone."""
-        self._held, self._margin = held, margin
-        self._scenes = [scene_of(parts), scene_of(())] if parts else [scene_of(())]
-        self._places = [[p for p in places if _in_reach(p.point, y)] for y in SHOULDERS]
-        self._hands = robot().groups["hands"]
+        """Sample states that keep ``margin`` [m] to ``parts``, or else to the fixtures alone.
+
+        Args:
+            held: The robot with its held objects.
+            parts: The parts, in the world.
+            places: Places that tips are sent to, in the cell's frame.
+            margin: [m].
+        """
+        self._held, self._margin, self._cell = held, margin, held.cell
+        bare = scene_of((), cell=held.cell)
+        self._scenes = [scene_of(parts, cell=held.cell), bare] if parts else [bare]
+        self._places = [[p for p in places if self._cell.in_reach(p.point, k)] for k in range(len(self._cell.arms))]
 
     def sample(self, rng: np.random.Generator) -> Array | None:
         """Return a state, shape (dof,), or None; where none is found among the parts, one that is clear without."""
         share = rng.random()
         if share < RESTING + CONTORTED:
             return self._joints(rng, rest=share < RESTING)
-        regions = (self._region(rng, 0), self._region(rng, 1))
+        regions = [self._region(rng, arm) for arm in range(len(self._cell.arms))]
         synergies = (self._held.low, self._held.high)
         for scene in self._scenes:
             sampler = HandPoseSampler(self._held.tables, scene, self._margin)
@@ -264,34 +276,31 @@ class EndSampler:
         return None
 
     def _joints(self, rng: np.random.Generator, *, rest: bool) -> Array | None:
-        some = robot()
+        some, tables = self._cell.robot, self._held.tables
+        hands = tables.synergies
         states = rng.uniform(some.limits.lower, some.limits.upper, (BATCH, some.dof))
         if rest:
             states[:] = some.home + rng.normal(0.0, REST_SPREAD, (BATCH, some.dof))
-        states[:, self._hands] = rng.uniform(self._held.low, self._held.high, (BATCH, 2))
+        states[:, hands] = rng.uniform(self._held.low, self._held.high, (BATCH, len(hands)))
         states[:] = np.round(np.clip(states, some.limits.lower, some.limits.upper), 6)
         states = states[[some.limit_fault(q) is None for q in states]]
         for scene in self._scenes:
-            clear = np.flatnonzero(has_clearance(Kernel(self._held.tables.both, scene), states, self._margin))
+            clear = np.flatnonzero(
+                self._held.tables.are_clear(Kernel(self._held.tables.whole, scene), states, self._margin)
+            )
             if len(clear):
                 return np.array(states[clear[0]])
         return None
 
-    def _region(self, rng: np.random.Generator, side: int) -> HandRegion:
-        """Return a region for a hand: around a place within reach, or wide."""
-        own = self._places[side]
+    def _region(self, rng: np.random.Generator, arm: int) -> Region:
+        """Return a region for a tip: around a place within reach, or wide."""
+        own = self._places[arm]
         if own and rng.random() < PLACED:
             one = own[int(rng.integers(len(own)))]
             x, y, z = ((float(v) - PLACE_WIDTH, float(v) + PLACE_WIDTH) for v in one.point)
             fingers = FINGERS if one.fingers is None or rng.random() < 0.2 else (one.fingers,)
-            return HandRegion(x, y, z, fingers)
-        return wide_region(side)
-
-
-def _in_reach(point: Array, shoulder: float) -> bool:
-    """Whether the arm at ``y = shoulder`` reaches a place above the tables and before it."""
-    x, y, z = point
-    return bool(x > 0.15 and 0.03 < z < 1.05 and np.linalg.norm([x, y - shoulder, z - 0.35]) < REACH)
+            return self._cell.region(HandRegion(x, y, z, fingers))
+        return self._cell.wide_region(arm)
 
 
 @cache

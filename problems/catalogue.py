@@ -15,7 +15,8 @@ from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.goals.state_sampling import HandPoseSampler
 from apex_ompl.problems import ID, alignment, broad, constrained, scenes
 from apex_ompl.problems.broad import GRAMMARS, SUITE
-from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, empty_hand_tables, robot
+from apex_ompl.problems.robot_cells import standard_cell
+from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.validation import check_name
 
@@ -122,7 +123,7 @@ def draw(problem_id: ProblemId, number: int) -> DrawnProblem | None:
     if problem_id.suite in GRAMMARS:
         return broad.draw(rng, problem_id.suite, problem_id.level)
     task = scenes.SUITES[problem_id.suite](rng, problem_id.level)
-    poses = HandPoseSampler(empty_hand_tables(), task.scene, MARGIN)
+    poses = HandPoseSampler(standard_cell().tables, task.scene, MARGIN)
     start = poses.sample(rng, task.start, SYNERGIES)
     goal = None if start is None else poses.sample(rng, task.goal, SYNERGIES)
     return None if start is None or goal is None else DrawnProblem(task.scene, start, goal)

@@ -22,10 +22,11 @@ from apex_ompl.kernel import SceneTables
 from apex_ompl.problems import constrained_scenes, scenes
 from apex_ompl.problems.broad import MOST_OBSTACLES, ROUNDING, UNSEEN, composition, in_the_way, near
 from apex_ompl.problems.broad_representation import Group, draw_representation, feasible, obstacles
-from apex_ompl.problems.broad_tasks import SHOULDERS, clear_parts, palm_line, scene_of
+from apex_ompl.problems.broad_tasks import clear_parts, scene_of, tips_on_line
 from apex_ompl.problems.broad_unseen import STRANGERS
 from apex_ompl.problems.constrained_ends import PalmSampler, are_joined, line_is_free, palms_at, palms_with_cups
 from apex_ompl.problems.constrained_held import CUPS, KINDS, Carried, draw_carried
+from apex_ompl.problems.robot_cells import SHOULDERS, standard_cell
 from apex_ompl.problems.suite_robot import MARGIN, DrawnProblem, robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.types import Array
@@ -74,7 +75,7 @@ def _drawn(
 
 
 def _tables(scene: Sequence[Obstacle], carried: Carried) -> SceneTables:
-    return scene_kernel(robot(), carried.held.tables.both, scene).scene
+    return scene_kernel(robot(), carried.held.tables.whole, scene).scene
 
 
 def _with_tray(rng: np.random.Generator, carried: Carried, suite: str, kind: str) -> DrawnProblem | None:
@@ -90,7 +91,7 @@ def _with_tray(rng: np.random.Generator, carried: Carried, suite: str, kind: str
 
 
 def _keeps_clear(carried: Carried, body: Obstacle, ends: Array) -> bool:
-    kernel = scene_kernel(robot(), carried.held.tables.both, [body])
+    kernel = scene_kernel(robot(), carried.held.tables.whole, [body])
     return bool((kernel.clearance(ends, MARGIN)[:, 0] >= MARGIN).all())
 
 
@@ -100,11 +101,11 @@ def _among_parts(rng: np.random.Generator, carried: Carried, kind: str, grammar:
     ends = _ends_anywhere(rng, carried, kind, scene_of(()))
     if ends is None:
         return None
-    found, tables = composition(rng, UNSEEN, STRANGERS[grammar]), carried.held.tables.both
+    found, tables = composition(rng, UNSEEN, STRANGERS[grammar]), carried.held.tables.whole
     if rng.random() < MET:
-        found = in_the_way(rng, found, palm_line(tables, ends, 9).reshape(-1, 3))
+        found = in_the_way(rng, found, tips_on_line(standard_cell(), tables, ends, 9))
     margin = MARGIN + ROUNDING + representation.swelling
-    parts = clear_parts(tables, near(found.parts)[:MOST_OBSTACLES], ends, margin)
+    parts = clear_parts(standard_cell(), tables, near(found.parts)[:MOST_OBSTACLES], ends, margin)
     groups = representation.groups(len(parts))
     return _drawn(carried, obstacles(parts), ends, groups if feasible(parts, groups) else ())
 

@@ -43,9 +43,9 @@ class PalmSampler:
         """Prepare the kernels; states keep ``margin`` [m] to the scene and between bodies of the robot."""
         held = carried.held
         self._held, self._margin = held, margin
-        self._kernel = Kernel(held.tables.both, scene)
-        self._arms = [Kernel(arm, scene) for arm in held.tables.arms]
-        self._right = list(held.tables.joints[1])
+        self._kernel = Kernel(held.tables.whole, scene)
+        self._arms = [Kernel(arm, scene) for arm in held.tables.alone]
+        self._right = list(held.tables.arms[1].joints)
 
     def sample(self, rng: np.random.Generator, palms: Sequence[Array], near: Array | None = None) -> Array:
         """Return states with the palms at poses, on several branches, shape (n, dof); none where none was found.
@@ -74,7 +74,7 @@ class PalmSampler:
         if not len(states):
             return states
         if near is not None:
-            arm = list(self._held.tables.joints[side])
+            arm = list(self._held.tables.arms[side].joints)
             states = states[np.abs(states - near)[:, arm].max(axis=1).argsort(kind="stable")]
         return states[has_clearance(self._arms[side], states, self._margin)][:ARM_STATES]
 
@@ -107,7 +107,7 @@ def line_is_free(carried: Carried, scene: SceneTables, ends: Array) -> bool:
     constraints = ConstraintSet.of(robot(), carried.constraints, carried.held.attached, ends[0])
     line = np.linspace(ends[0], ends[1], LINE_STATES + 2)[1:-1]
     moved = constraints.project(line)
-    kernel = Kernel(carried.held.tables.both, scene)
+    kernel = Kernel(carried.held.tables.whole, scene)
     return bool(moved.ok.all()) and bool(has_clearance(kernel, moved.states, LINE_MARGIN).all())
 
 
@@ -117,7 +117,7 @@ def are_joined(carried: Carried, ends: Array) -> bool:
     States of a closed chain may lie in parts that joint limits and the robot itself keep apart.
     """
     constraints = ConstraintSet.of(robot(), carried.constraints, carried.held.attached, ends[0])
-    kernel = Kernel(carried.held.tables.both, scene_tables([]))
+    kernel = Kernel(carried.held.tables.whole, scene_tables([]))
     paths = ConstrainedPaths(kernel, constraints, Optimizer(), lambda states: True)
     trees = paths.trees(ends[:1], ends[1:], np.random.default_rng(0))
     return trees is not None and trees.grow(TREE_ITERATIONS) is not None

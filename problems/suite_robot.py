@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 
-from apex_ompl.goals.state_sampling import DualArmTables
 from apex_ompl.problems.broad_representation import Group, given
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -26,12 +24,6 @@ LOW, HIGH = np.array([-0.2, -0.6, 0.1]), np.array([0.6, 0.6, 0.9])  # of the pla
 def robot() -> Robot:
     """Return the robot of the suites."""
     return load_robot(ROBOT)
-
-
-@cache
-def empty_hand_tables() -> DualArmTables:
-    """Return the kernel's tables of the robot with empty hands."""
-    return DualArmTables.of(robot())
 
 
 @dataclass(frozen=True, eq=False)

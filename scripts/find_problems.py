@@ -167,7 +167,7 @@ def find_carried(specification: CarrySpecification) -> Problem:
     robot, scene, name = load_robot("dual_panda_softhand"), tuple(specification.scene()), Path(specification.file).stem
     has_tray = len(specification.start) == 1
     carried = carried_tray(TraySize(0.2, 0.26, 0.6), loaded=True) if has_tray else held_cups()
-    tables = scene_kernel(robot, carried.held.tables.both, scene).scene
+    tables = scene_kernel(robot, carried.held.tables.whole, scene).scene
     sampler, rng = PalmSampler(carried, tables, MARGIN), np.random.default_rng(specification.seed)
 
     def states(points: Sequence[tuple[float, float, float]], yaws: tuple[float, float], near: np.ndarray | None = None):

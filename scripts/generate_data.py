@@ -13,120 +13,51 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.kernel import RobotTables
 from apex_ompl.paths.spline import Spline
+from apex_ompl.training import generation
 from apex_ompl.training.engine import EngineOptions
+from apex_ompl.training.generation import Generation, Work
 from apex_ompl.training.kernel_problems import load_kernel_problems, save_kernel_problems, solve_kernel_problems
-from apex_ompl.training.records import Paths
 from apex_ompl.training.store import Store
-from apex_ompl.util.cluster import spread
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import check_writable, make_folder
-from apex_ompl.util.provenance import versions
 from apex_ompl.util.validation import one_or_more, whole_number
 
 LATEST = 800_000  # from this seed on problems are not of the training split
 # Pinocchio, Coal and OMPL are imported where problems are drawn: --cases needs none of them.
 
-LIBRARIES = ("apex-ompl", "ompl", "pin", "coal", "numba", "numpy", "zarr")
-Solve = Callable[[Any, EngineOptions, Spline], tuple[Paths, dict[str, float]]]
-Solved = tuple[str, Paths, dict[str, float]]
-
-
-def solve_all(
-    solve: Solve, units: dict[str, Any], options: EngineOptions, spline: Spline, *, workers: int, address: str | None
-) -> Iterator[Solved]:
-    """Yield name, paths and times of units as they are solved: in this process, or by Ray with workers or a cluster.
-
-    Raises:
-        ClusterError: Ray is missing, or a worker failed.
-    """
-    if not units or (workers == 1 and address is None):
-        for name, unit in units.items():
-            yield name, *solve(unit, options, spline)
-        return
-    jobs = {name: (unit, options, spline) for name, unit in units.items()}
-    for name, (paths, times) in spread(solve, jobs, workers=workers, address=address):
-        yield name, paths, times
-
 
 def generate(args: argparse.Namespace) -> None:
     """Solve the units that the data set lacks."""
-    import tqdm  # noqa: F401 - fails here where it is missing, and not after the first unit
-    import zarr  # noqa: F401
-
-    spline = Spline(args.control_points, args.pinned)
-    solve, units, about, tables = _read_units(args) if args.cases else _planned_units(args)
-    options = EngineOptions(args.seed, args.copies, 0 if args.cases else args.parts, args.model)
-    manifest = {
-        **about, "seed": args.seed, "copies": args.copies,
-        "parts": options.parts, "model": args.model, "control_points": args.control_points, "pinned": args.pinned,
-        "degree": spline.degree,
-        "split": "train", "python": platform.python_version(),
-        "versions": versions(LIBRARIES),
-    }  # fmt: skip
-    same = (
-        "robot",
-        "joints",
-        "seed",
-        "copies",
-        "parts",
-        "model",
-        "control_points",
-        "pinned",
-        "degree",
-        "problems_per_unit",
-    )
-    store = Store.create(args.folder, manifest, same)
-    with store.locked():
-        if tables is not None:
-            tables.save(store.folder / "robot.npz")
-        there = set(store.units())
-        left = {name: unit for name, unit in units.items() if name not in there}
-        source = solve_all(solve, left, options, spline, workers=args.workers, address=args.address)
-        paths, seconds = _write_units(store, source, len(units), len(left), args)
-        total = summary(store)
-        store.note(counts=total)
-    print(f"{args.folder}: {total['paths']} paths of {total['solved']} problems in {total['units']} units", end="")
-    print(f"; {paths} of them now, {paths / seconds:.1f} a second" if left else "; nothing was left to do")
-
-
-def _write_units(
-    store: Store, source: Iterator[Solved], units: int, left: int, args: argparse.Namespace
-) -> tuple[int, float]:
-    """Write the units, and note the run in the manifest; return the number of paths, and the time [s]."""
+    import zarr  # noqa: F401 - fails here where it is missing, and not after the first unit
     from tqdm import tqdm
 
-    started, done, paths, times = time.perf_counter(), 0, 0, Counter[str]()
-    seconds = 0.0
-    try:
-        with tqdm(total=units, initial=units - left, unit="unit", disable=args.quiet) as bar:
-            for name, found, spent in source:
-                store.write(name, found)
-                done, paths = done + 1, paths + len(found)
-                times.update(spent)
-                rate = paths / (time.perf_counter() - started)
-                bar.set_postfix_str(f"{rate:.1f} paths/s, {name}")
-                bar.update()
-    finally:
-        source.close()
-        seconds = time.perf_counter() - started
-        if done:
-            run = {"workers": args.workers, "seconds": round(seconds, 1), "units": done, "paths": paths}
-            run["worker_seconds"] = {stage: round(value, 1) for stage, value in sorted(times.items())}
-            store.note(runs=[*store.manifest.get("runs", []), run])
-    return paths, max(seconds, 1e-9)
+    work = _read_units(args) if args.cases else _planned_units(args)
+    options = EngineOptions(args.seed, args.copies, 0 if args.cases else args.parts, args.model)
+    spline = Spline(args.control_points, args.pinned)
+    known = Store(args.folder).units() if (Path(args.folder) / "manifest.json").is_file() else []
+    there = len(set(work.units).intersection(known))
+    with tqdm(total=len(work.units), initial=there, unit="unit", disable=args.quiet) as bar:
+
+        def report(name: str, paths: int, seconds: float) -> None:
+            bar.set_postfix_str(f"{paths / seconds:.1f} paths/s, {name}")
+            bar.update()
+
+        settings = Generation(options, spline, args.workers, args.address)
+        done = generation.generate(Path(args.folder), work, settings, report)
+    total, left = done.total, len(work.units) - there
+    print(f"{args.folder}: {total['paths']} paths of {total['solved']} problems in {total['units']} units", end="")
+    print(
+        f"; {done.paths} of them now, {done.paths / done.seconds:.1f} a second" if left else "; nothing was left to do"
+    )
 
 
-def _planned_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dict[str, Any], RobotTables]:
-    """Return the solving function, units to draw, the robot for the manifest, and its tables with empty hands."""
+def _planned_units(args: argparse.Namespace) -> Work:
+    """Return units to draw."""
     from apex_ompl.collision import CollisionChecker
     from apex_ompl.problems.suite_robot import robot
     from apex_ompl.training.units import plan_units, solve_unit
@@ -134,11 +65,11 @@ def _planned_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dic
     units = {unit.name: unit for unit in plan_units(args.problems, args.levels)}
     sizes = {unit.size for unit in units.values()}
     about = {"robot": robot().name, "joints": list(robot().joint_names), "problems_per_unit": max(sizes)}
-    return solve_unit, units, about, CollisionChecker(robot()).kernel.robot
+    return Work(solve_unit, units, about, CollisionChecker(robot()).kernel.robot)
 
 
-def _read_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dict[str, Any], RobotTables | None]:
-    """Return the solving function, the units of --cases, the robot for the manifest, and its tables where known.
+def _read_units(args: argparse.Namespace) -> Work:
+    """Return the units of --cases.
 
     Raises:
         ParameterError: Suites are named as well, or problems are not to be trained with.
@@ -155,7 +86,7 @@ def _read_units(args: argparse.Namespace) -> tuple[Solve, dict[str, Any], dict[s
     first, tables = problems[0], next((p.robot for p in problems if json.loads(p.record.held) == []), None)
     sizes = {len(unit) for unit in units.values()}
     about = {"robot": first.robot.name, "joints": list(first.robot.joint_names), "problems_per_unit": max(sizes)}
-    return solve_kernel_problems, units, about, tables
+    return Work(solve_kernel_problems, units, about, tables)
 
 
 def write_cases(args: argparse.Namespace) -> None:
@@ -171,16 +102,6 @@ def write_cases(args: argparse.Namespace) -> None:
     problems = [problem for unit in units for problem in kernel_problems(unit)]
     save_kernel_problems(args.folder, problems)
     print(f"{args.folder}: {len(problems)} problems in {len({problem.unit for problem in problems})} units")
-
-
-def summary(store: Store) -> dict[str, Any]:
-    """Return the number of units, paths and problems of a data set, and the sums of its statistics."""
-    total: Counter[str] = Counter(units=0, paths=0, solved=0)
-    for paths in store:
-        total.update({"units": 1, "paths": len(paths)})
-        total.update({key: n for key, n in paths.counts.items() if isinstance(n, int)})
-        total["unsolved"] += len(paths.counts.get("unsolved", ()))
-    return dict(total)
 
 
 def main() -> None:

@@ -8,15 +8,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
+from apex_ompl.apex.model_search import AUTO, NONE, find_model, robot_fault
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.checker import NO_POINT
-from apex_ompl.errors import MissingFileError
 from apex_ompl.kernel import Kernel
-from apex_ompl.model.checkpoint import SHIPPED, read_config, shared_model
+from apex_ompl.model.checkpoint import shared_model
 from apex_ompl.model.diffusion import Callback, Estimate, NoiseSchedule
 from apex_ompl.model.geometry import Numbers
 from apex_ompl.model.primitive_fit import scene_of_primitives
@@ -24,6 +23,7 @@ from apex_ompl.model.proposals import Proposals, Sampling, TrajectoryModel
 from apex_ompl.model.query import Query
 from apex_ompl.ompl.own_planner import SolveReport
 from apex_ompl.paths.optimizer import PERTURBATION_SIZE, Optimizer
+from apex_ompl.robot import Robot
 from apex_ompl.types import Array
 
 
@@ -68,46 +68,29 @@ class PerturbationModel:
         return self.propose(query, kernel, len(control), sampling=sampling, generator=generator)
 
 
-DEFAULT = "apex"  # checkpoint that ships
-AUTO, NONE = "auto", "none"  # names in the place of a checkpoint's
-
 Model = TrajectoryModel | PerturbationModel
 """A model of proposals."""
 
 
-def has_model(robot: str) -> bool:
-    """Whether a trained model ships for a robot.
-
-    Raises:
-        FileFormatError: The configuration of the checkpoint that ships is damaged.
-    """
-    return _robot_of_default() == robot
-
-
-@cache
-def _robot_of_default() -> str | None:
-    """Return the name of the robot of the checkpoint that ships, None where there is none."""
-    try:
-        return read_config(SHIPPED / DEFAULT).model.robot
-    except MissingFileError:
-        return None
-
-
-def trajectory_model(name: str, robot: str, device: str = "cpu") -> Model:
+def trajectory_model(name: str, robot: Robot, device: str = "cpu") -> Model:
     """Return a checkpoint's model for a robot, or random perturbations.
 
     Args:
-        name: Name or folder of a checkpoint; ``auto`` takes the one that ships for the robot, or ``none`` where there
-            is none: random perturbations of straight lines.
-        robot: Name of the robot.
+        name: Name or folder of a checkpoint; ``auto`` takes the one that :func:`find_model` finds, or ``none`` where
+            there is none: random perturbations of straight lines.
+        robot: The robot.
         device: Where a network runs.
 
     Raises:
         ApexError: The checkpoint cannot be loaded, or is of another robot.
     """
-    if name == AUTO:
-        name = DEFAULT if has_model(robot) else NONE
-    return PerturbationModel() if name == NONE else shared_model(name, device=device, robot=robot)
+    name = find_model(robot).name if name == AUTO else name
+    if name == NONE:
+        return PerturbationModel()
+    fault = robot_fault(name, robot)
+    if fault is not None:
+        raise fault
+    return shared_model(name, device=device, robot=robot.name)
 
 
 def make_query(checker: CollisionChecker, start: Array, goal: Array, *, point: bool = True) -> Query:

@@ -76,7 +76,7 @@ class APEX(OwnPlanner):
         self.stages = given.stages() if stages is None else list(stages)
         self._constrained_stages = given.constrained_stages() if stages is None else self.stages
         self.validator = PathValidator(si, "" if given.robot == AUTO else given.robot)
-        robot = self.validator.checker.robot.name
+        robot = self.validator.checker.robot
         self.model = trajectory_model(self.parameters.model, robot, self.parameters.device)
         steps, most = self.parameters.denoising_steps, self.model.schedule.steps
         if steps > most:

@@ -140,6 +140,7 @@ def _add_plan(commands: Commands[argparse.ArgumentParser], name: str, text: str)
     parser.add_argument("--timeout", type=float, default=5.0, metavar="SECONDS", help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="default: %(default)s")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a planner parameter")
+    parser.add_argument("--model", metavar="FOLDER", help="checkpoint of the proposals of apex (default: the robot's)")
     parser.add_argument(
         "--params", type=Path, metavar="FILE", help="planner parameters in YAML; --set goes before them"
     )
@@ -368,7 +369,7 @@ def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _add_robot(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = commands.add_parser("robot", help="set up your own robot: new, check, prepare")
+    parser = commands.add_parser("robot", help="set up your own robot: new, check, prepare, train")
     steps = parser.add_subparsers(dest="step", required=True, metavar="STEP")
     new = steps.add_parser("new", help="write the robot file of a URDF, or of several in one cell")
     new._negative_number_matcher = re.compile(r"^-[\d.]")  # --at -0.5,0,0,0 is no option
@@ -416,3 +417,18 @@ def _add_robot(commands: Commands[argparse.ArgumentParser]) -> None:
     )  # fmt: skip
     prepare.add_argument("--seed", type=int, default=0, help="of the states (default: %(default)s)")
     prepare.set_defaults(run="robot:prepare")
+    train = steps.add_parser("train", help="train a model for a robot; resumes where it was stopped")
+    train.add_argument("robot", metavar="FILE", help="robot file, which is made to name the model; or a name")
+    train.add_argument(
+        "--hours", type=float, default=2.0, metavar="H", help="that data, training and validation may take together "
+        "(default: %(default)s)",
+    )  # fmt: skip
+    train.add_argument(
+        "--jobs", type=int, default=1, metavar="N", help="processes that generate data (default: %(default)s)"
+    )
+    train.add_argument("--seed", type=int, default=0, help="default: %(default)s")
+    train.add_argument(
+        "-o", "--out", type=Path, metavar="DIR", help="data and state of the training (default: NAME.training beside "
+        "the robot file)",
+    )  # fmt: skip
+    train.set_defaults(run="robot_train:train")

@@ -53,6 +53,8 @@ def run(parsed: argparse.Namespace) -> int:
     unnamed = [key for key in params if not isinstance(key, str)]
     if unnamed:
         raise ParameterError(str(parsed.params), unnamed[0], "names of parameters, in quotes where YAML reads others")
+    if parsed.model is not None:
+        params["model"] = parsed.model
     params |= {name.replace("-", "_"): value for name, value in name_value_pairs("--set", parsed.set).items()}
     if parsed.controllers and (parsed.out is None or not parsed.out.name.endswith(MESSAGES)):
         raise ParameterError("--controllers", str(parsed.out), f"--out with a name ending in {' or '.join(MESSAGES)}")

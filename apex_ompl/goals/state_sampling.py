@@ -1,10 +1,11 @@
-"""Sampling of collision-free states by inverse kinematics: both hands in given regions, or two held objects aligned."""
+"""Sampling of collision-free states by inverse kinematics: all hands in given regions, or two held objects aligned."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,9 @@ from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.collision.tables import primitives
 from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.goals.alignment import RESTART_SPREAD, AlignmentGoal
+from apex_ompl.goals.arms import Arm, arms_of
 from apex_ompl.goals.grasp import HandObjects, close_hands
-from apex_ompl.kernel import Kernel, RobotTables, SceneTables, offset_target, opposition_target
+from apex_ompl.kernel import Kernel, RobotTables, SceneTables, Target, offset_target, opposition_target
 from apex_ompl.kernel.scene_builder import Solids, tables_of
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
@@ -28,6 +30,7 @@ Direction = tuple[float, float, float]
 
 POSE_TOLERANCE = 1e-3  # largest residual of a hand pose that counts as reached [m, and of unit vectors]
 SEED_SPREAD = 0.6  # standard deviation of the seeds of inverse kinematics around home [rad]
+OTHERS_SPREAD = 0.15  # the same for joints that belong to no arm, which are not moved by it [rad, m]
 SEEDS = 32  # descents for one hand
 DESCENT_STEPS = 40  # most steps of a descent of inverse kinematics
 MAX_ARM_STATES = 4  # states of one arm that are combined with those of the other arm
@@ -80,42 +83,81 @@ class HandRegion:
         return point, self.fingers[int(rng.integers(len(self.fingers)))]
 
 
+class Region(Protocol):
+    """Where the tip of an arm is sent, such as a :class:`HandRegion`."""
+
+    def sample(self, rng: np.random.Generator) -> tuple[Array, Direction]:
+        """Return a point, shape (3,) [m], and a unit direction of the fingers, in the world."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
-class DualArmTables:
-    """Kernel tables of a robot with empty hands: of both arms, and of each arm alone.
+class ArmTables:
+    """Kernel tables of a robot: of all of it, and of each arm alone.
 
     Attributes:
         robot: The robot.
-        both: Tables of the whole robot, with the objects that it holds.
-        arms: Tables that check the left arm with its hand, and the right one, and ignore all other bodies.
-        joints: Numbers of the joints of the left arm and hand, and of the right ones.
+        arms: Its arms.
+        whole: Tables of the whole robot, with the objects that it holds.
+        alone: Tables that check one arm with its hand, and ignore the bodies of the others, for each arm.
+        others: Indices of the planned joints that belong to no arm, such as a torso's.
+        synergies: Indices of the joints that close the hands.
+        own_margin: Whether bodies of the robot keep a margin from one another, too; else they are proved apart.
     """
 
     robot: Robot
-    both: RobotTables
-    arms: tuple[RobotTables, RobotTables]
-    joints: tuple[tuple[int, ...], tuple[int, ...]]
+    arms: tuple[Arm, ...]
+    whole: RobotTables
+    alone: tuple[RobotTables, ...]
+    others: tuple[int, ...]
+    synergies: tuple[int, ...]
+    own_margin: bool
 
     @classmethod
-    def of(cls, robot: Robot) -> DualArmTables:
-        """Return the tables of a robot whose joint names start with ``left_`` or ``right_``."""
-        left, right = (
-            tuple(k for k, name in enumerate(robot.joint_names) if name.startswith(side))
-            for side in ("left_", "right_")
-        )
-        both = CollisionChecker(robot).kernel.robot
-        return cls(robot, both, (both.restricted_to(left), both.restricted_to(right)), (left, right))
+    def of(cls, robot: Robot, attached: Sequence[AttachedObject] = (), *, own_margin: bool) -> ArmTables:
+        """Return the tables of a robot and the objects that it holds.
+
+        Args:
+            robot: The robot.
+            attached: The objects.
+            own_margin: Whether bodies of the robot keep a margin from one another.
+
+        Raises:
+            RobotError: The robot has no arms.
+        """
+        arms = arms_of(robot)
+        others = tuple(sorted(set(range(robot.dof)).difference(*(arm.joints for arm in arms))))
+        whole = CollisionChecker(robot, (), attached).kernel.robot
+        alone = tuple(whole.restricted_to((*arm.joints, *others)) for arm in arms)
+        names = (robot.hands[arm.hand].synergy for arm in arms if arm.hand is not None)
+        synergies = tuple(robot.joint_names.index(name) for name in names if name is not None)
+        return cls(robot, arms, whole, alone, others, synergies, own_margin)
+
+    def are_clear(self, kernel: Kernel, states: Array, margin: float) -> NDArray[np.bool_]:
+        """Whether states keep a margin to the scene and, where ``own_margin``, between bodies of the robot.
+
+        Args:
+            kernel: Some of the tables in a scene.
+            states: Shape (N, dof).
+            margin: [m].
+
+        Returns:
+            Shape (N,).
+        """
+        if self.own_margin or not len(states):
+            return has_clearance(kernel, states, margin)
+        return np.asarray((kernel.clearance(states, margin)[:, 0] >= margin) & (kernel.unproved(states)[1] == 0))
 
 
 class HandPoseSampler:
-    """Sampler of states with both hands in regions of one scene.
+    """Sampler of states with the tips of all arms in regions of one scene.
 
     Each arm is placed by itself: descents of inverse kinematics from random seeds, of which those are kept that leave
-    the arm a margin to the scene. Then every kept state of the left arm is combined with every one of the right arm,
-    and the first combination with the margin is returned.
+    the arm a margin to the scene. Then every kept state of an arm is combined with every one of the others, and the
+    first combination with the margin is returned. Arms of few joints reach points, in any direction.
     """
 
-    def __init__(self, tables: DualArmTables, scene: Sequence[Obstacle] | SceneTables, margin: float) -> None:
+    def __init__(self, tables: ArmTables, scene: Sequence[Obstacle] | SceneTables, margin: float) -> None:
         """Prepare the kernels of a scene; states keep ``margin`` [m] to obstacles, fixtures and between bodies.
 
         Args:
@@ -125,62 +167,83 @@ class HandPoseSampler:
         """
         self.robot = tables.robot
         self.margin = margin
-        self._joints = tables.joints
-        self._hands = self.robot.groups["hands"]
+        self._tables = tables
         if isinstance(scene, SceneTables):
-            self._kernel = Kernel(tables.both, scene)
+            self._kernel = Kernel(tables.whole, scene)
         else:
-            self._kernel = scene_kernel(self.robot, tables.both, scene)
-        self._arm_kernels = [Kernel(arm, self._kernel.scene) for arm in tables.arms]
+            self._kernel = scene_kernel(self.robot, tables.whole, scene)
+        self._arm_kernels = [Kernel(arm, self._kernel.scene) for arm in tables.alone]
 
     def sample(
-        self,
-        rng: np.random.Generator,
-        regions: tuple[HandRegion, HandRegion],
-        synergies: Synergies,
-        attempts: int = 4,
+        self, rng: np.random.Generator, regions: Sequence[Region], synergies: Synergies, attempts: int = 4
     ) -> Array | None:
-        """Return a state with the left and the right hand in their regions, or None when none was found.
+        """Return a state with the tip of each arm in its region, or None when none was found.
 
         Args:
             rng: Source of targets and seeds.
-            regions: Of the left and of the right hand.
-            synergies: Least and largest synergy of both hands, or of each, shape (2,).
-            attempts: Number of pairs of targets to try.
+            regions: Of the arms.
+            synergies: Least and largest synergy of all hands that close, or of each.
+            attempts: Number of targets to try for each arm.
 
         Returns:
             Shape (dof,), rounded to a millionth of a radian.
         """
-        right_joints = list(self._joints[1])
+        others = self._tables.others
         for _ in range(attempts):
-            left, right = [self._sample_arm(rng, arm, region, synergies) for arm, region in enumerate(regions)]
-            if not (len(left) and len(right)):
+            rest = self._rest(rng) if others else self.robot.home
+            found = [self._sample_arm(rng, arm, region, synergies, rest) for arm, region in enumerate(regions)]
+            if not all(map(len, found)):
                 continue
-            both = np.repeat(left, len(right), axis=0)
-            both[:, right_joints] = np.tile(right, (len(left), 1))[:, right_joints]
-            clear = np.flatnonzero(has_clearance(self._kernel, both, self.margin))
+            states = found[0]
+            for arm, own in zip(self._tables.arms[1:], found[1:], strict=True):
+                states = _combined(states, own, arm)
+            clear = np.flatnonzero(self._tables.are_clear(self._kernel, states, self.margin))
             if len(clear):
-                return np.array(both[clear[0]])
+                return np.array(states[clear[0]])
         return None
 
-    def _sample_arm(self, rng: np.random.Generator, arm: int, region: HandRegion, synergies: Synergies) -> Array:
-        """Return up to ``MAX_ARM_STATES`` states with one hand in its region; the other arm is ignored."""
-        links, hand = Links.of(self.robot), list(self.robot.hands.values())[arm]
+    def _rest(self, rng: np.random.Generator) -> Array:
+        """Return a state around home, shape (dof,)."""
+        limits, spread = self.robot.limits, rng.normal(0.0, OTHERS_SPREAD, self.robot.dof)
+        return np.asarray(np.round(np.clip(self.robot.home + spread, limits.lower, limits.upper), 6))
+
+    def _sample_arm(
+        self, rng: np.random.Generator, number: int, region: Region, synergies: Synergies, rest: Array
+    ) -> Array:
+        """Return up to ``MAX_ARM_STATES`` states with one tip in its region; the other arms are ignored.
+
+        Args:
+            rng: Source of the target and the seeds.
+            number: Number of the arm.
+            region: Where its tip is sent.
+            synergies: See :meth:`sample`.
+            rest: State of the joints that belong to no arm, shape (dof,).
+        """
+        links, arm, tables = Links.of(self.robot), self._tables.arms[number], self._tables
         point, fingers = region.sample(rng)
-        targets = [
-            offset_target(in_world(point), links.point(hand.palm, hand.point)),
-            opposition_target(links.direction(hand.palm, hand.fingers), in_world(fingers), -1.0),
-        ]
+        targets: list[Target] = [offset_target(in_world(point), links.point(arm.link, arm.point))]
+        if arm.is_pointed:
+            targets.append(opposition_target(links.direction(arm.link, arm.fingers), in_world(fingers), -1.0))
         seeds = self.robot.home + rng.normal(0.0, SEED_SPREAD, (SEEDS, self.robot.dof))
-        seeds[:, self._hands] = rng.uniform(*synergies, (SEEDS, len(self._hands)))
-        descents = links.inverse(targets).descend(seeds, tolerance=POSE_TOLERANCE, max_steps=DESCENT_STEPS)
+        seeds[:, tables.synergies] = rng.uniform(*synergies, (SEEDS, len(tables.synergies)))
+        seeds[:, tables.others] = rest[list(tables.others)]
+        solver = links.inverse(targets, tables.others)
+        descents = solver.descend(seeds, tolerance=POSE_TOLERANCE, max_steps=DESCENT_STEPS)
         reached = np.round(descents.states[descents.errors <= POSE_TOLERANCE], 6)
         if not len(reached):
             return reached
         reached = reached[[self.robot.limit_fault(q) is None for q in reached]]
         if not len(reached):
             return reached
-        return np.array(reached[has_clearance(self._arm_kernels[arm], reached, self.margin)][:MAX_ARM_STATES])
+        clear = tables.are_clear(self._arm_kernels[number], reached, self.margin)
+        return np.array(reached[clear][:MAX_ARM_STATES])
+
+
+def _combined(states: Array, own: Array, arm: Arm) -> Array:
+    """Return every state with the joints of an arm as in every state of ``own``."""
+    found, mine = states[np.repeat(np.arange(len(states)), len(own))], list(arm.joints)
+    found[:, mine] = np.tile(own, (len(states), 1))[:, mine]
+    return found
 
 
 class AlignmentSampler:

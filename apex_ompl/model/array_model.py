@@ -24,7 +24,7 @@ from apex_ompl.model.config import OBSTACLE_SCENES, ModelConfig, key_shapes
 from apex_ompl.model.geometry import SHAPES, signed_distances
 from apex_ompl.model.guidance import Guidance, collision_cost
 from apex_ompl.model.proposals import TrajectoryModel
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER, ObstacleSet, Probes, Query
+from apex_ompl.model.query import MAX_DISTANCE, ObstacleSet, Probes, Query
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_integer
@@ -143,9 +143,8 @@ class ArrayModel(TrajectoryModel):
         ends = np.array([[q.start, q.goal] for q in queries], np.float32)
         scaled = np.asarray(2.0 * (ends - lower) / (upper - lower) - 1.0, np.float32)
         parts: list[Single] = [scaled.reshape(len(queries), -1)]
-        center = np.array(WORKSPACE_CENTER, np.float32)
         if self.config.condition.point:
-            parts.append(np.array([q.point for q in queries], np.float32) - center)
+            parts.append(self._centered(np.array([q.point for q in queries], np.float32)))
         if self.scene_encoding is not None:
             parts.append(self.scene_encoding.features(queries, kernel))
         if self.config.condition.scene in OBSTACLE_SCENES:
@@ -190,19 +189,23 @@ class ArrayModel(TrajectoryModel):
         """Return the control points of straight lines between ends of shape (B, dof)."""
         return np.asarray(start)[:, None] + self._shares * (np.asarray(goal) - start)[:, None]
 
+    def _centered(self, points: Single) -> Single:
+        """Return points relative to the middle of the workspace, shape (..., 3)."""
+        condition = self.config.condition
+        return np.asarray((points - np.array(condition.center, np.float32)) / np.float32(condition.reach), np.float32)
+
     def _obstacle_features(self, obstacles: ObstacleSet, probes: Single) -> Single:
         """Return the obstacle features of a query, shape (features,), for probe points of shape (L, P, 3) [m]."""
         along, count = probes.shape[:2]
-        center = np.array(WORKSPACE_CENTER, np.float32)
         position, size = (np.asarray(v, np.float32) for v in (obstacles.position, obstacles.size))
         rotation = np.asarray(obstacles.rotation, np.float32)
         kinds = np.eye(len(SHAPES), dtype=np.float32)[obstacles.shape]
-        inputs, parts = [kinds, position - center, rotation.reshape(-1, 9), size], []
+        inputs, parts = [kinds, self._centered(position), rotation.reshape(-1, 9), size], []
         if self.config.condition.scene == "distances":
             points = np.broadcast_to(probes.reshape(1, -1, 3), (len(obstacles), along * count, 3))
             distances = signed_distances(obstacles.shape, position, rotation, size, points)
             distances = np.clip(distances, -MAX_DISTANCE, MAX_DISTANCE) / np.float32(MAX_DISTANCE)
-            parts += [(probes - center).ravel(), distances.min(axis=0, initial=1.0)]
+            parts += [self._centered(probes).ravel(), distances.min(axis=0, initial=1.0)]
             few = distances.reshape(-1, along, count)[:, [0, along // 2, -1]]
             inputs.append(few.reshape(-1, 3 * count))
         tokens = np.concatenate(inputs, axis=1)

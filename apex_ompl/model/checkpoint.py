@@ -83,7 +83,7 @@ def read_checkpoint(
     Raises:
         UnknownNameError, MissingFileError, FileFormatError: As :func:`load_model` does.
     """
-    folder = _folder(name)
+    folder = checkpoint_folder(name)
     for file in (CONFIG, WEIGHTS):
         if not is_file(folder / file):
             raise MissingFileError(str(folder / file), ROLE)
@@ -147,7 +147,7 @@ def shared_model(name: str | os.PathLike[str], *, device: str = "cpu", robot: st
     Raises:
         ApexError: As :func:`load_model` does.
     """
-    return _shared(_folder(name), device=device, robot=robot)
+    return _shared(checkpoint_folder(name), device=device, robot=robot)
 
 
 class FolderCache(Generic[T]):
@@ -183,7 +183,12 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONFIG}")))
 
 
-def _folder(name: str | os.PathLike[str]) -> Path:
+def checkpoint_folder(name: str | os.PathLike[str]) -> Path:
+    """Return the folder of a checkpoint by its name or folder.
+
+    Raises:
+        ApexError: There is none.
+    """
     text = path_text(name, "model")
     if text in shipped():
         return SHIPPED / text

@@ -12,6 +12,9 @@ Count = Annotated[int, Field(ge=1)]
 Size = Annotated[int, Field(ge=1, le=16_384)]  # of layers and inputs; larger ones would exhaust the memory
 
 
+WORKSPACE_CENTER = (0.4, 0.0, 0.6)
+"""Origin of all points among the features of a model, by default [m]."""
+
 OBSTACLE_SCENES = ("set", "distances")
 """Scenes of conditions that see obstacles one by one."""
 
@@ -55,6 +58,8 @@ class ConditionConfig(StrictModel):
         along: Number of states of the straight line at which the probe points are placed.
         keys: Number of key states of ``clearances``.
         hands: Links whose held objects ``clearances`` sees.
+        center: Origin of the points among the features, in the middle of the robot's workspace [m].
+        reach: Length by which positions relative to it are divided [m].
         refined: Whether the denoiser of ``clearances`` also sees the obstacles along its own last estimate of the path.
     """
 
@@ -65,6 +70,8 @@ class ConditionConfig(StrictModel):
     along: Annotated[Size, Field(ge=2)] = 7
     keys: Size = 512
     hands: tuple[str, ...] = ()
+    center: tuple[float, float, float] = WORKSPACE_CENTER
+    reach: Annotated[float, Field(gt=0.0)] = 1.0
     refined: bool = False
 
     @model_validator(mode="after")

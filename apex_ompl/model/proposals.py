@@ -19,7 +19,7 @@ from apex_ompl.model.diffusion import SAMPLERS, Callback, Estimate, NoiseSchedul
 from apex_ompl.model.geometry import Numbers
 from apex_ompl.model.guidance import Guidance, guided
 from apex_ompl.model.query import Probes, Query
-from apex_ompl.model.scene_encoding import KeyStates, SceneEncoding
+from apex_ompl.model.scene_encoding import KeyStates, encoding_of
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import StageClock
@@ -96,7 +96,7 @@ class TrajectoryModel(ABC):
         self.config, self.about, self.probes = config, dict(about), probes
         self.spline = Spline(**config.spline.model_dump())
         self.schedule = NoiseSchedule(config.noise.steps, config.noise.schedule)
-        self.scene_encoding = SceneEncoding(KeyStates.of(**keys), probes, config.condition.hands) if keys else None
+        self.scene_encoding = encoding_of(config.condition, KeyStates.of(**keys), probes) if keys else None
         self.sampling = Sampling(**config.sampling.model_dump())
         self._along_basis = self.spline.basis(probes.shares)
 

@@ -25,9 +25,6 @@ radii are kept."""
 KINEMATICS_BATCH = 1024
 """Number of paths whose joint frames are in memory at the same time."""
 
-WORKSPACE_CENTER = (0.4, 0.0, 0.6)
-"""Origin of all points among the features of a model [m]."""
-
 MAX_DISTANCE = 0.4
 """Largest distance among the features of a model; larger ones are clipped [m]."""
 

@@ -26,9 +26,9 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.kernel.scene_distances import group_clearances, nearest_points
 from apex_ompl.kernel.tables import SceneTables
-from apex_ompl.model.config import HELD_FEATURES, PIECES
+from apex_ompl.model.config import HELD_FEATURES, PIECES, WORKSPACE_CENTER, ConditionConfig
 from apex_ompl.model.geometry import HeldExtent
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER, Probes, Query
+from apex_ompl.model.query import MAX_DISTANCE, Probes, Query
 from apex_ompl.types import Array, Flags
 
 ROUNDS = 10  # of Lloyd's algorithm, which divides a cluster's spheres among its pieces
@@ -150,11 +150,15 @@ class SceneEncoding:
         keys: Key states.
         probes: Probe points.
         hands: Links that hold objects.
+        center: Origin of the points among the features, shape (3,) [m].
+        reach: Length by which positions relative to it are divided [m].
     """
 
     keys: KeyStates
     probes: Probes
     hands: Sequence[str]
+    center: Sequence[float] = WORKSPACE_CENTER
+    reach: float = 1.0
     _placed: dict[str, tuple[tuple[Array, Array], Array]] = field(default_factory=dict, init=False)
 
     def features(self, queries: Sequence[Query], kernel: Kernel) -> NDArray[np.float32]:
@@ -195,7 +199,7 @@ class SceneEncoding:
         found = distances.reshape(points.shape[:2]), gradients.reshape(points.shape)
         pushed = kernel.joint_pushes(frames, probes.joint, points, found, REACH)
         near = np.maximum(distances, -MAX_DISTANCE) / MAX_DISTANCE
-        parts = (points - np.array(WORKSPACE_CENTER), near, gradients, pushed)
+        parts = ((points - np.array(self.center)) / self.reach, near, gradients, pushed)
         return np.concatenate([part.reshape(count, -1) for part in parts], axis=1, dtype=np.float32, casting="unsafe")
 
     def held(self, extents: Sequence[HeldExtent]) -> NDArray[np.float32]:
@@ -207,3 +211,8 @@ class SceneEncoding:
                 low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
                 row[0], row[1:4], row[4:] = 1.0, (low + high) / 2.0 / HELD_SIZE, (high - low) / 2.0 / HELD_SIZE
         return found.ravel()
+
+
+def encoding_of(condition: ConditionConfig, keys: KeyStates, probes: Probes) -> SceneEncoding:
+    """Return the scene encoding of a condition's configuration."""
+    return SceneEncoding(keys, probes, condition.hands, condition.center, condition.reach)

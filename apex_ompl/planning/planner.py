@@ -263,7 +263,7 @@ class MotionPlanner:
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
         with unforked():
-            from apex_ompl.apex.models import has_model
+            from apex_ompl.apex.model_search import model_notes
             from apex_ompl.apex.parameters import NAME
             from apex_ompl.collision.conservative import CheckCounts
             from apex_ompl.ompl.process import Interrupt, quiet_ompl
@@ -282,8 +282,8 @@ class MotionPlanner:
         with quiet_ompl(), ExitStack() as preparing:
             preparing.enter_context(unforked())
             notes = snapshot_notes(changing) if options.snapshot else []
-            if planner is None and not has_model(robot.name):
-                notes.append(f"no model of {robot.name} ships, so random perturbations take the place of proposals")
+            if planner is None and self.model is None and "model" not in (options.params or {}):
+                notes += model_notes(robot)
             parameters = planners.chosen(
                 NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
             )

@@ -142,6 +142,7 @@ class RobotConfig(StrictModel):
         poses: Named states: joint name -> value; joints that one leaves out are at home. ``home`` is there already.
         disabled_pairs: File of further link pairs that are not checked for collision.
         covers: File of sphere covers of the links; without it coarser covers are made at run time.
+        model: Folder of the checkpoint of a model that was trained for the robot, relative to the robot file.
         packages: Package name -> its folder, for ``package://NAME/...``; relative to the robot file.
     """
 
@@ -157,6 +158,7 @@ class RobotConfig(StrictModel):
     poses: dict[Name, dict[str, float]] = {}
     disabled_pairs: str | None = None
     covers: str | None = None
+    model: str | None = None
     packages: dict[str, str] = {}
 
     def package_folders(self, folder: Path) -> dict[str, Path]:

@@ -126,6 +126,7 @@ class Robot:
         part_links: Part name -> names of its links.
         urdf: The composed URDF with absolute mesh paths.
         covers: File of the links' sphere covers, or None.
+        checkpoint: Folder of the model that the robot file names, which need not exist, or None.
         files: Files that the robot was read from, meshes among them.
     """
 
@@ -145,6 +146,7 @@ class Robot:
     part_links: Mapping[str, tuple[str, ...]]
     urdf: str
     covers: Path | None
+    checkpoint: Path | None
     files: tuple[Path, ...]
     _order: NDArray[np.intp]
 
@@ -429,7 +431,7 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         name=config.name, joint_names=names, limits=limits, effort=effort, home=home, poses=poses, groups=groups,
         hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures, weights=weights,
         continuous=continuous, part_links=composition.part_links, urdf=composition.urdf, covers=covers,
-        files=tuple(files), _order=order,
+        checkpoint=None if config.model is None else path.parent / config.model, files=tuple(files), _order=order,
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.config import key_shapes
 from apex_ompl.model.query import Probes
-from apex_ompl.model.scene_encoding import KeyStates, SceneEncoding, key_states
+from apex_ompl.model.scene_encoding import KeyStates, SceneEncoding, encoding_of, key_states
 from apex_ompl.training.conditions import Augmentation, Conditions, ConditionTable, EncodedPaths
 from apex_ompl.training.config import TrainingConfig
 from apex_ompl.training.records import SPLINE, Paths, to_half, to_micro
@@ -275,7 +275,7 @@ class TrainingData:
         self.spline = {k: paths.about[k] for k in SPLINE}
         train, _ = split(paths, config.held_out)
         if self.scene_encoding is None and config.condition.scene == "clearances":
-            self.scene_encoding = SceneEncoding(self._key_states(train), self.probes, config.condition.hands)
+            self.scene_encoding = encoding_of(config.condition, self._key_states(train), self.probes)
             kind = KernelSceneEncoding if self._device.type == "cpu" else TorchSceneEncoding
             self._batch_encoding = kind(self.scene_encoding, self._kernel, self._device)
             self._spline = train.spline

@@ -112,7 +112,7 @@ class LatentDiffusion(nn.Module):
         self.encoder = ConditionEncoder(
             dof, out=condition.out, width=condition.width, scene=condition.scene, point=condition.point,
             probes=config.probes, along=condition.along, scene_features=config.scene_features,
-            refined=config.along_size if condition.refined else 0,
+            refined=config.along_size if condition.refined else 0, center=condition.center, reach=condition.reach,
         )  # fmt: skip
         latent_shape, net = self.autoencoder.latent, config.denoiser
         if net.kind == "unet":

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.model.config import OBSTACLE_SCENES
+from apex_ompl.model.config import OBSTACLE_SCENES, WORKSPACE_CENTER
 from apex_ompl.model.geometry import SHAPES
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER
+from apex_ompl.model.query import MAX_DISTANCE
 from apex_ompl.training.conditions import Conditions, pad_obstacles
 
 PADDING = -1e4  # below every feature, for the maximum over obstacles
@@ -38,7 +38,7 @@ class ConditionEncoder(nn.Module):
 
     def __init__(
         self, dof: int, *, out: int, width: int, scene: str, point: bool, probes: int, along: int,
-        scene_features: int = 0, refined: int = 0,
+        scene_features: int = 0, refined: int = 0, center: Sequence[float] = WORKSPACE_CENTER, reach: float = 1.0,
     ) -> None:  # fmt: skip
         """Make an encoder.
 
@@ -52,12 +52,14 @@ class ConditionEncoder(nn.Module):
             along: Number L of states of the straight line at which they are placed.
             scene_features: Number of features of ``clearances``.
             refined: Number of features along an estimate that :meth:`refine` sees; 0 where there are none.
+            center: Origin of the points among the features [m].
+            reach: Length by which positions relative to it are divided [m].
         """
         super().__init__()
-        self.scene, self.point, self.along = scene, point, along
+        self.scene, self.point, self.along, self.reach = scene, point, along, reach
         self.register_buffer("lower", torch.full((dof,), -1.0))
         self.register_buffer("upper", torch.full((dof,), 1.0))
-        self.register_buffer("center", torch.tensor(WORKSPACE_CENTER), persistent=False)
+        self.register_buffer("center", torch.tensor(center), persistent=False)
         size = 2 * dof + 3 * point
         if scene in OBSTACLE_SCENES:
             features = len(SHAPES) + 15 + (3 * probes if scene == "distances" else 0)
@@ -91,25 +93,29 @@ class ConditionEncoder(nn.Module):
         span = self.upper - self.lower
         parts = [2.0 * (q - self.lower) / span - 1.0 for q in (conditions.start, conditions.goal)]
         if self.point:
-            parts.append(conditions.point - self.center)
+            parts.append(self._centered(conditions.point))
         if self.scene in OBSTACLE_SCENES:
             parts += self._obstacle_features(conditions)
         parts.append(conditions.features)
         encoded: Tensor = self.phi(torch.cat(parts, dim=1))
         return encoded
 
+    def _centered(self, points: Tensor) -> Tensor:
+        """Return points relative to the middle of the workspace, shape (..., 3)."""
+        return (points - self.center) / self.reach
+
     def _obstacle_features(self, conditions: Conditions) -> list[Tensor]:
         """Return features of the obstacles, tensors of shape (B, features)."""
         mask = conditions.mask
         o = conditions.obstacles()
         kinds = nn.functional.one_hot(o.shape, len(SHAPES)).to(o.position)
-        inputs = [kinds, o.position - self.center, o.rotation.flatten(1), o.size]
+        inputs = [kinds, self._centered(o.position), o.rotation.flatten(1), o.size]
         parts: list[Tensor] = []
         if self.scene == "distances":
             along, probes = conditions.probes.shape[1:3]
             with torch.autocast(mask.device.type, enabled=False):  # half precision is some millimeters off
                 distances = conditions.probe_distances().clamp(-MAX_DISTANCE, MAX_DISTANCE) / MAX_DISTANCE
-            parts += [(conditions.probes - self.center).flatten(1), pad_obstacles(distances, mask, 1.0).amin(dim=1)]
+            parts += [self._centered(conditions.probes).flatten(1), pad_obstacles(distances, mask, 1.0).amin(dim=1)]
             inputs.append(distances.reshape(-1, along, probes)[:, [0, along // 2, -1]].flatten(1))
         tokens = self.thing(torch.cat(inputs, dim=1))
         mean = pad_obstacles(tokens, mask, 0.0).sum(dim=1) / mask.sum(dim=1, keepdim=True).clamp(min=1)

@@ -19,7 +19,7 @@ from apex_ompl.kernel.arrays import FIXED, REVOLUTE
 from apex_ompl.kernel.scene_distances import ObstacleBatch
 from apex_ompl.model.config import PIECES
 from apex_ompl.model.geometry import SHAPES, signed_distances
-from apex_ompl.model.query import MAX_DISTANCE, WORKSPACE_CENTER
+from apex_ompl.model.query import MAX_DISTANCE
 from apex_ompl.model.scene_encoding import KEY_RANGE, REACH, SceneEncoding
 from apex_ompl.types import Array
 
@@ -240,7 +240,7 @@ class TorchSceneEncoding:
         self._chain_joint = self._index([place[j] for j in chains.joint.tolist()])
         self._ball_chain_joint = self._index([place[j] for j in ball_chains.joint.tolist()])
         self._ball_joint = self._index([[place[j] for j in row] for row in encoding.keys.joint.tolist()])
-        self._center = self.tensor(WORKSPACE_CENTER)
+        self._center, self._unit = self.tensor(encoding.center), encoding.reach
 
     @staticmethod
     def _with_parents(parents: np.ndarray, joints: list[int]) -> list[int]:
@@ -335,7 +335,7 @@ class TorchSceneEncoding:
         frames = rotation[:, self._chain_joint][..., 2], origin[:, self._chain_joint]
         pushed = pushes(self._chains, frames, points, distances, gradients)
         near = distances.clamp(min=-MAX_DISTANCE) / MAX_DISTANCE
-        parts = (points - self._center, near, gradients, pushed)
+        parts = ((points - self._center) / self._unit, near, gradients, pushed)
         return torch.cat([part.reshape(count, -1) for part in parts], dim=1)
 
     def at_keys(self, obstacles: Obstacles) -> Tensor:

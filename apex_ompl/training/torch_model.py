@@ -269,8 +269,26 @@ def model_card(config: ModelConfig, trained: Mapping[str, Any], weights: int) ->
     if {"phase", "step", "seconds", "paths"} <= trained.keys():
         lines += [
             "",
-            f"Trained by `scripts/train.py`: {trained['phase']}, step {trained['step']}, {trained['seconds'] / 60:.0f} "
+            f"Trained: {trained['phase']}, step {trained['step']}, {trained['seconds'] / 60:.0f} "
             f"min, {trained['paths']} paths in memory (mirror images counted). The configuration is in `config.json`.",
         ]
+    if "validation" in trained:
+        lines += ["", *_gain_lines(trained["validation"])]
     lines += ["", "It proposes paths; they are not valid until they are checked. `apex_ompl.load_model` reads it.", ""]
     return "\n".join(lines)
+
+
+def _gain_lines(told: Mapping[str, Any]) -> list[str]:
+    """Return what the plans of a validation with and without the model showed, Markdown."""
+    rows = [("solved", "solved"), ("CPU time, p50 [s]", "p50"), ("CPU time, p95 [s]", "p95")]
+    low, high = told["interval"]
+    stages = ", ".join(f"{stage} {count}" for stage, count in told["stages"].items()) or "none"
+    return [
+        f"## {told['verdict'].capitalize()}", "",
+        f"{told['problems']} validation problems whose straight line is not free, each planned by `apex` with this "
+        f"model and with random perturbations in its place, at most {told['timeout']:g} s, untimed:", "",
+        "| | with the model | without |", "|---|---:|---:|",
+        *(f"| {label} | {told[key][0]} | {told[key][1]} |" for label, key in rows), "",
+        f"Ratio of the CPU times, where both solve the problem: {told['ratio']} (95 %: {low} to {high}).",
+        f"What found the paths with the model: {stages}.",
+    ]  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,11 +20,11 @@ from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.optimizer import Optimizer
 from apex_ompl.paths.path import SEARCH_RESOLUTION
 from apex_ompl.paths.spline import Spline
-from apex_ompl.problems import scenes
-from apex_ompl.problems.broad import GRAMMARS
-from apex_ompl.problems.broad_representation import part_of
+from apex_ompl.problems import robot_problems, scenes
+from apex_ompl.problems.broad import GRAMMARS, SUITE
+from apex_ompl.problems.broad_representation import part_of, swollen
 from apex_ompl.problems.catalogue import KNOWN, LEVELS, SPLITS, TRAINING, VALIDATION, SuiteError
-from apex_ompl.problems.suite_robot import robot
+from apex_ompl.problems.suite_robot import ROBOT
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.training.engine import Engine, EngineOptions, PathFinder, ProblemRecord
@@ -49,6 +49,7 @@ class Unit:
         number: Index of the unit among those of the level.
         size: Number of problems that are drawn.
         split: Split of the problems' seeds.
+        robot: Robot of the problems: that of the suites, or the file of another one, for ``broad`` alone.
     """
 
     suite: str
@@ -56,6 +57,7 @@ class Unit:
     number: int
     size: int = UNIT_SIZE
     split: str = "train"
+    robot: str = ROBOT
 
     @property
     def name(self) -> str:
@@ -138,25 +140,45 @@ def kernel_problems(unit: Unit) -> list[KernelProblem]:
     with quiet_ompl():
         for seed in unit.seeds:
             try:
-                problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
+                problem, scene = drawn_problem(unit, seed)
             except SuiteError:
                 continue
-            scene = problems.primitives(problem, enclosing=True)
-            setup = assemble(problem.model_copy(update={"scene": scene}), robot())
+            setup = assemble(problem.model_copy(update={"scene": tuple(scene)}), robot_problems.robot_of(unit.robot))
             kernel, start, goal = setup.checker.kernel, setup.start, setup.goals[0]
             points = np.stack([setup.checker.obstacle_point(start), setup.checker.obstacle_point(goal)])
-            names, record = (unit.name, unit.suite, unit.level, unit.strategy), problem_record(problem, seed)
+            names, record = (unit.name, unit.suite, unit.level, unit.strategy), problem_record(problem, seed, scene)
             found.append(KernelProblem(*names, record, kernel.robot, kernel.scene, start, goal, points))
     return found
 
 
-def problem_record(problem: Problem, seed: int) -> ProblemRecord:
-    """Return the record of a problem in a data set: its obstacles as primitives, whatever they are given as.
+def plan_robot_units(file: str, size: int, split: str = "train") -> Iterator[Unit]:
+    """Yield units of problems for the robot of a file: the levels of ``broad`` in turn, until no seeds are left."""
+    for number in range(len(SPLITS[split]) // size):
+        for level in robot_problems.LEVELS:
+            yield Unit(SUITE, level, number, size, split, file)
 
-    The primitives contain the meshes and the balls around points. Held meshes are named by their files, without
-    folders; each held object has its ``extent``, see :func:`apex_ompl.collision.shapes.held_extent`.
+
+def drawn_problem(unit: Unit, seed: int) -> tuple[Problem, Sequence[Obstacle]]:
+    """Return a problem of a unit, and its obstacles as primitives, which contain meshes and the balls around points.
+
+    Raises:
+        SuiteError: It cannot be drawn.
     """
-    scene = problems.primitives(problem, enclosing=True)
+    if unit.robot == ROBOT:
+        problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
+        return problem, problems.primitives(problem, enclosing=True)
+    drawn = robot_problems.drawn_for(robot_problems.robot_of(unit.robot), unit.level, seed)
+    problem = robot_problems.problem_of(drawn, unit.robot, unit.level, seed)
+    return problem, swollen(drawn.scene, drawn.groups)
+
+
+def problem_record(problem: Problem, seed: int, scene: Sequence[Obstacle] | None = None) -> ProblemRecord:
+    """Return the record of a problem in a data set, by its obstacles as primitives, by default those of its id.
+
+    Held meshes are named by their files, without folders; each held object has its ``extent``, see
+    :func:`apex_ompl.collision.shapes.held_extent`.
+    """
+    scene = problems.primitives(problem, enclosing=True) if scene is None else scene
     return ProblemRecord(seed, held_text(problem.attached), [_obstacle_record(obstacle) for obstacle in scene])
 
 
@@ -189,13 +211,14 @@ def solve_unit(unit: Unit, options: EngineOptions, spline: Spline) -> tuple[Path
         The paths, and the time by stage [s].
     """
     engine = Engine(unit.name, (unit.suite, unit.level), unit.strategy, options, spline)
-    model = _model(options.model, spline) if options.model else None
+    robot = robot_problems.robot_of(unit.robot)
+    model = _model(options.model, spline, robot.name) if options.model else None
     with quiet_ompl():
         for seed in unit.seeds:
             with engine.timed("draw"):
                 try:
-                    problem = problems.load(f"{unit.suite}/{unit.level}/{seed}")
-                    finder = MeshPathFinder(assemble(problem, robot()), engine.optimizer)
+                    problem, scene = drawn_problem(unit, seed)
+                    finder = MeshPathFinder(assemble(problem, robot), engine.optimizer)
                 except SuiteError:
                     engine.counts["not drawn"] += 1
                     continue
@@ -203,20 +226,20 @@ def solve_unit(unit: Unit, options: EngineOptions, spline: Spline) -> tuple[Path
                 finder.iterations = BROAD_ITERATIONS
             if model is not None:
                 finder.proposer = _proposer(model, finder)
-            engine.solve(finder, problem_record(finder.setup.problem, seed))
-    return engine.paths(robot().name, robot().joint_names), engine.times
+            engine.solve(finder, problem_record(finder.setup.problem, seed, scene))
+    return engine.paths(robot.name, robot.joint_names), engine.times
 
 
 @cache
-def _model(name: str, spline: Spline) -> TrajectoryModel:
-    """Return a model of paths by a spline.
+def _model(name: str, spline: Spline, robot: str) -> TrajectoryModel:
+    """Return a model of paths of a robot by a spline.
 
     Raises:
         ApexError: There is no such model, or it is for another robot or spline.
     """
     from apex_ompl.model.checkpoint import load_model
 
-    model = load_model(name, robot=robot().name)
+    model = load_model(name, robot=robot)
     if model.spline != spline:
         raise ParameterError("model", name, f"one of paths by {spline}")
     return model

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from ompl import base as ob
 
-from apex_ompl.apex.models import AUTO, DEFAULT
+from apex_ompl.apex.model_search import AUTO, DEFAULT
 from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.apex.planner import APEX
 from apex_ompl.errors import ParameterError

@@ -67,7 +67,7 @@ def proposed(job: Job) -> Run:
     """
     setup, taken_as = assemble(load_problem(job.problem), robot(), job.seed), job.params["taken_as"]
     kernel, start, goal = setup.checker.kernel, setup.start, setup.goals[0]
-    model = trajectory_model(job.params["model"], setup.robot.name)
+    model = trajectory_model(job.params["model"], setup.robot)
     optimizer = (MotionOptimizer if taken_as == AS_MOTION else DurationOptimizer)(kernel, setup.robot.limits)
     found, first, begun = list[float](), None, time.process_time()
     query = make_query(setup.checker, start, goal, point=model.sees_point)

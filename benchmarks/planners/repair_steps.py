@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 
 from apex_ompl import problems
-from apex_ompl.apex.models import NONE, Model, make_query, trajectory_model
+from apex_ompl.apex.model_search import NONE
+from apex_ompl.apex.models import Model, make_query, trajectory_model
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run
@@ -50,7 +51,7 @@ LINE, PERTURBED, RANDOM = "straight line", "perturbations", "random weights"
 @cache
 def model(name: str) -> Model:
     """Return a model by its name, folder or kind."""
-    return drawn(load_torch_model("apex").network) if name == RANDOM else trajectory_model(name, robot().name)
+    return drawn(load_torch_model("apex").network) if name == RANDOM else trajectory_model(name, robot())
 
 
 def row(label: str, name: str, digest: str = "") -> Row:

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from planning import HARD, cached_problem
 from support import ROOT
 
-from apex_ompl import plan, run
-from apex_ompl.apex.models import PerturbationModel, has_model, make_query, trajectory_model
+from apex_ompl import load_robot, plan, run
+from apex_ompl.apex.models import PerturbationModel, make_query, trajectory_model
 from apex_ompl.api import load_problem
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import FileFormatError
@@ -58,12 +58,12 @@ def test_perturbations_are_larger_at_higher_temperature(baxter: Robot) -> None:
 
 
 def test_what_proposes_for_a_robot() -> None:
-    assert has_model("dual_panda_softhand") and not has_model("baxter")
-    assert isinstance(trajectory_model("auto", "baxter"), PerturbationModel)
-    assert isinstance(trajectory_model("none", "dual_panda_softhand"), PerturbationModel)
-    assert isinstance(trajectory_model("auto", "dual_panda_softhand"), TrajectoryModel)
+    pandas, baxter = load_robot("dual_panda_softhand"), load_robot("baxter")
+    assert isinstance(trajectory_model("auto", baxter), PerturbationModel)
+    assert isinstance(trajectory_model("none", pandas), PerturbationModel)
+    assert isinstance(trajectory_model("auto", pandas), TrajectoryModel)
     with pytest.raises(FileFormatError, match="expected 'baxter'"):
-        trajectory_model("apex", "baxter")
+        trajectory_model("apex", baxter)
 
 
 def test_apex_plans_without_a_model() -> None:

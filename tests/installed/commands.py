@@ -41,7 +41,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         ((0,), f"{command} {rest}")
         for command in ("plan", "sequence")
         for rest in (
-            "own.yaml --timeout 20 --out plan.npz --snapshot --leave-contact 0.001",
+            "own.yaml --model apex --timeout 20 --out plan.npz --snapshot --leave-contact 0.001",
             "own.yaml --planner rrtconnect --params params.yaml --set range=0.7 --seed 1 --timeout 20 --no-simplify "
             "--timing-method spline --velocity-scale 0.9 --acceleration-scale 0.9 --jerk-scale 0.9 "
             "--max-velocity left_joint1=1.5 --max-acceleration left_joint1=10 --max-jerk left_joint1=1000 "
@@ -99,12 +99,14 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
         "robot prepare arm.robot.yaml --budget 120 --jobs 2 --effort 1 --samples 600 --margin 0.01 --seed 1 --soft arm",
     ),
     ((0,), "robot check arm.robot.yaml"),
+    ((0,), "robot train arm.robot.yaml --hours 0.001 --jobs 1 --seed 1 --out training"),
+    ((2,), "robot train arm.robot.yaml --hours 0"),
     ((2,), "robot new gone.urdf"),
 )
 WRITTEN = (
     "plan.npz", "motion.traj.yaml", "path.json", "run.npz", "real.json", "plan.png", "plan.svg", "run.png", "page.html",
-    "arm.robot.yaml", "arm.spheres.json", "converted.yaml", "camera.yaml", "carried.yaml", "seen.png",
-    "report/report.html", "report/report.md",
+    "arm.robot.yaml", "arm.spheres.json", "arm.model/README.md", "converted.yaml", "camera.yaml", "carried.yaml",
+    "seen.png", "report/report.html", "report/report.md",
 )  # fmt: skip
 
 

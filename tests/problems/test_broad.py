@@ -32,7 +32,7 @@ from apex_ompl.problems.broad_representation import (
 from apex_ompl.problems.broad_tasks import KINDS, OPEN, clear_parts, difficulty, draw_held, scene_of, sprint
 from apex_ompl.problems.catalogue import ProblemId, first_drawn
 from apex_ompl.problems.frozen import digest
-from apex_ompl.problems.suite_robot import empty_hand_tables
+from apex_ompl.problems.robot_cells import standard_cell
 from apex_ompl.robot import Robot
 from apex_ompl.training.units import Unit, plan_units, problem_record
 
@@ -146,8 +146,8 @@ def test_parts_near_the_ends_are_left_out(robot: Robot) -> None:
     parts = some_parts(200, 7)
     placed = broad_parts.place(parts, broad_parts.shift(0.4, 0.3, 0.4))
     ends = np.stack([robot.home, robot.home + 0.1])
-    tables = empty_hand_tables().both
-    left = clear_parts(tables, placed, ends, 0.01)
+    tables = standard_cell().tables.whole
+    left = clear_parts(standard_cell(), tables, placed, ends, 0.01)
     assert 0 < len(left) < len(placed)
     kernel = Kernel(tables, scene_of(left))
     assert kernel.clearance(ends, 0.02)[:, 0].min() >= 0.01
@@ -158,7 +158,7 @@ def test_parts_near_the_ends_are_left_out(robot: Robot) -> None:
 
 
 def test_classes_of_difficulty_are_in_order(robot: Robot) -> None:
-    tables = empty_hand_tables().both
+    tables = standard_cell().tables.whole
     drawn = first_drawn(ProblemId("broad", "boulders", 3))[1]
     ends = np.stack([drawn.start, drawn.goal])
     free = Kernel(tables, scene_of(()))
@@ -184,7 +184,7 @@ def test_held_objects_are_of_all_kinds_and_free_of_the_fingers(robot: Robot) -> 
         held = draw_held(np.random.default_rng([2, seed]))
         hands.append(len({body.link for body in held.attached}))
         seen |= {kind for kind in KINDS for body in held.attached if kind in body.name}
-        assert (held.low <= held.high).all() and held.tables.both.dof == robot.dof
+        assert (held.low <= held.high).all() and held.tables.whole.dof == robot.dof
     assert seen == set(KINDS)
     assert 0.3 < hands.count(0) / 40 < 0.65 and hands.count(1) > 4 and hands.count(2) > 4
 

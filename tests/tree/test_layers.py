@@ -6,7 +6,8 @@ From the top, as CONTRIBUTING has it:
    `ros2` is a node of ROS 2.
 2. `api`: `load_problem`, `setup`, `plan`, `run`; `loop`: environment, sensor, executor and clocks; `loop.replan`:
    replanners; `physics`: tasks executed in physics, and judges.
-3. `planning`: `MotionPlanner`, `World`, the steps of a plan; `result`: what a plan returns.
+3. `onboarding`: training of a new robot's model; `planning`: `MotionPlanner`, `World`, the steps of a plan; `result`:
+   what a plan returns.
 4. `planners/`, `problems/` (at the top of the tree): planners by name with their parameters; suites, worlds, frozen
    problems.
 5. `baselines`: the rivals gpmp, damon, drrt, imitation and control; `training`: torch networks, data sets, their
@@ -52,6 +53,7 @@ LAYERS = [
     {"planners"},
     {"result"},
     {"planning"},
+    {"onboarding"},
     {"loop", "physics"},
     {"api"},
     {"evaluation", "ros2", "viz"},

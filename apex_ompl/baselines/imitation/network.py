@@ -9,8 +9,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from apex_ompl.baselines.imitation.config import NetworkConfig
+from apex_ompl.model.config import WORKSPACE_CENTER
 from apex_ompl.model.geometry import SHAPES
-from apex_ompl.model.query import WORKSPACE_CENTER
 from apex_ompl.training.conditions import Conditions
 
 OBSTACLE_FEATURES = len(SHAPES) + 3 + 9 + 3  # one-hot shape, position, rotation matrix, size

@@ -109,13 +109,13 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
     covers.make(covers.all, 1, time.monotonic() + QUICK_SHARE * settings.budget)
     files, links, known = [pairs_file], None, dict[str, str | None]()
     if covers_file.exists():
-        _name_in(path, {"covers": covers_file})
+        name_in(path, {"covers": covers_file})
         known = {"covers": str(covers_file), "disabled_pairs": str(pairs_file) if pairs_file.exists() else None}
         files += [covers_file, *_prepare_tables(build_robot(config.model_copy(update=known), path), deadline, report)]
     if not covers.missing:
         links = Links.of(build_robot(config.model_copy(update=known | {"disabled_pairs": None}), path))
     count, complete = _prepare_pairs(robot, config, pairs_file, settings, report, links=links)
-    _name_in(path, {"disabled_pairs": pairs_file})
+    name_in(path, {"disabled_pairs": pairs_file})
     if covers_file.exists():
         if covers.missing:
             covers.make(covers.all, 1, deadline)
@@ -251,7 +251,7 @@ def _weights(path: Path, robot: Robot) -> dict[str, float]:
     return weights
 
 
-def _name_in(path: Path, files: Mapping[str, Path]) -> None:
+def name_in(path: Path, files: Mapping[str, Path]) -> None:
     """Add lines to a robot file that name files beside it, where it does not name them; the rest stays as it is."""
     config = read_config(path)
     lines = [f"{key}: {file.name}" for key, file in files.items() if getattr(config, key) is None]

@@ -106,7 +106,7 @@ class Proposals:
             ApexError: The checkpoint cannot be loaded, or is of another robot.
         """
         setup = context.setup
-        self._loaded, self._checker = trajectory_model(self.model, setup.robot.name), fresh_checker(context)
+        self._loaded, self._checker = trajectory_model(self.model, setup.robot), fresh_checker(context)
         query = make_query(self._checker, setup.start, setup.start, point=self._loaded.sees_point)
         with self._loaded.one_thread():
             self._loaded.propose(query, self._checker.kernel, self.count)

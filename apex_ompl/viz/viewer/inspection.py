@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.apex.models import DEFAULT, has_model, make_query
+from apex_ompl.apex.model_search import NONE, find_model
+from apex_ompl.apex.models import make_query
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.model.checkpoint import shared_model
@@ -36,8 +37,9 @@ class Inspection:
         self._player, self._editor, self._nodes = player, editor, dict[str, Any]()
         self._estimates: list[Array] = []
         self._model: TrajectoryModel | None = None
-        if not has_model(player.sources[0].setup.robot.name):
-            return  # no model of this robot ships
+        self._name = find_model(player.sources[0].setup.robot).name
+        if self._name == NONE:
+            return
         with server.gui.add_folder("proposals", expand_by_default=False):
             self._count = server.gui.add_slider("number", min=1, max=64, step=1, initial_value=8)
             self._gamma = server.gui.add_number("guidance", initial_value=1.0, min=0.0)
@@ -73,7 +75,7 @@ class Inspection:
         problem = problem_at(editor.problem(), 0.0)
         checker = CollisionChecker(robot, problem.scene, problem.attached, problem.allowed)
         if self._model is None:
-            self._model = shared_model(DEFAULT, device="cpu", robot=robot.name)
+            self._model = shared_model(self._name, device="cpu", robot=robot.name)
         model, kernel = self._model, checker.kernel
         query = make_query(checker, editor.start, editor.goal, point=model.sees_point)
         count, seed = int(self._count.value), int(self._seed.value)
