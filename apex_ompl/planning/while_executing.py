@@ -346,7 +346,8 @@ class _Places:
             if not np.isin(edges, self._edges).all():
                 self._edges, self._free = edges, self._examined(edges)
             rows = np.searchsorted(self._edges, places)
-            return self._spans(places, np.logical_not(self._free[rows]).any(axis=1), grown, end)
+            blocked: Flags = np.logical_not(self._free[rows])
+            return self._spans(places, blocked[:, 0] | blocked[:, 1], grown, end)
 
         return find
 

@@ -365,8 +365,8 @@ def given_fields(body: Body, left_out: Collection[str] = ()) -> dict[str, Any]:
 def size_note(body: Body) -> str:
     """Return a sentence on a body that is so long that another unit is likely; else nothing."""
     bar = body.cylinder or body.capsule
-    lengths = body.box or ((2.0 * body.sphere.radius,) if body.sphere is not None else ())
-    lengths = (2.0 * bar.radius, bar.length) if bar is not None else lengths
+    lengths = [*(body.box or ()), *([2.0 * body.sphere.radius] if body.sphere is not None else [])]
+    lengths += [2.0 * bar.radius, bar.length] if bar is not None else []
     longest = max(lengths, default=0.0)
     return f"{body.name} is {longest:g} m long; lengths are meters" if longest >= LONG else ""
 
