@@ -73,7 +73,9 @@ def training_config(
     """
     size = next(one for one in SIZES if seconds >= one.seconds)
     hands = [cell.robot.hands[arm.hand].palm for arm in cell.arms if arm.hand is not None]
-    center = WORKSPACE if cell.pose is None else cell.pose[:3, :3] @ (cell.size * np.array(WORKSPACE)) + cell.pose[:3, 3]
+    center = (
+        WORKSPACE if cell.pose is None else cell.pose[:3, :3] @ (cell.size * np.array(WORKSPACE)) + cell.pose[:3, 3]
+    )
     return {
         "schema": "apex-ompl/training/1", "data": str(paths), "robot": str(paths / "robot.npz"), "seed": seed,
         "latent": {"kind": "linear", "dim": min(LATENT * cell.robot.dof, Spline().free * cell.robot.dof)},
