@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.robot_cells import Cell
 from apex_ompl.training.config import TrainingConfig
@@ -71,7 +73,9 @@ def training_config(
     """
     size = next(one for one in SIZES if seconds >= one.seconds)
     hands = [cell.robot.hands[arm.hand].palm for arm in cell.arms if arm.hand is not None]
-    center = WORKSPACE if cell.pose is None else cell.pose[:3, :3] @ (cell.size * _column(WORKSPACE)) + cell.pose[:3, 3]
+    center = (
+        WORKSPACE if cell.pose is None else cell.pose[:3, :3] @ (cell.size * np.array(WORKSPACE)) + cell.pose[:3, 3]
+    )
     return {
         "schema": "apex-ompl/training/1", "data": str(paths), "robot": str(paths / "robot.npz"), "seed": seed,
         "latent": {"kind": "linear", "dim": min(LATENT * cell.robot.dof, Spline().free * cell.robot.dof)},
@@ -85,12 +89,6 @@ def training_config(
         "batch": size.batch, "rate": 1e-3, "decay": 0.1, "sampling": {"temperature": 1.3}, "parts": 0.5, "mixed": 0.8,
         "collision": 2.0, "mirror": mirror, "save_every": SAVE_EVERY,
     }  # fmt: skip
-
-
-def _column(values: Sequence[float]) -> Any:
-    import numpy as np
-
-    return np.asarray(values, float)
 
 
 def with_steps(config: dict[str, Any], seconds: float) -> dict[str, Any]:
