@@ -32,6 +32,7 @@ FOLDER = RUNS / "ik_branches"
 SEEDS = {"test": 900_000, "validation": 800_000}
 ROBOT, HAND = "panda", "hand"
 STARTS = 30  # of the dense search
+STEPS = 100  # most evaluations of each descent
 COUNT = 1000  # most solutions
 REACHED = 1e-7  # largest element of the logarithm
 HEAD = (
@@ -59,7 +60,7 @@ def dense(planner: MotionPlanner, wanted: pin.SE3, rng: np.random.Generator) -> 
         return np.asarray(here @ columns[:, np.argsort(robot.state_order)])
 
     for q in robot.random_state(rng, STARTS):
-        end = least_squares(residual, q, jacobian, bounds=(limits.lower, limits.upper), xtol=1e-12, max_nfev=30)
+        end = least_squares(residual, q, jacobian, bounds=(limits.lower, limits.upper), xtol=1e-12, max_nfev=STEPS)
         if np.abs(end.fun).max() < REACHED and planner.is_free(end.x):
             found.append(end.x)
     return found
