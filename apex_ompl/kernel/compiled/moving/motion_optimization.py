@@ -8,8 +8,8 @@ whose k-th differences are D_k P,
 
 counts velocities, accelerations and jerks: those of a cubic spline are convex combinations of these numbers.
 
-Joints may follow a given motion, as those of another arm do: at the samples they have its values, and their control points
-stay.
+Joints may follow a given motion, as those of another arm do: at the samples they have its values, and their control
+points stay.
 """
 
 from __future__ import annotations
