@@ -1,8 +1,8 @@
 """Inverse kinematics against a dense search: share of its branches that ``planner.ik`` finds, and time a solution.
 
 Targets are poses of the Panda's hand at random free states. The dense search descends from random states by SciPy's
-bounded least squares on Pinocchio's logarithm of the pose; a free state of it counts as found where a solution is within
-the spacing of solutions, 0.1 rad in each joint. Times are those of the process. Targets are kept in
+bounded least squares on Pinocchio's logarithm of the pose; a free state of it counts as found where a solution is
+within the spacing of solutions, 0.1 rad in each joint. Times are those of the process. Targets are kept in
 benchmarks/runs/ik_branches when they are done, in order; the command resumes.
 
 Usage: python -m benchmarks.planners.ik_branches [-n 10000] [--split test] [--report]
