@@ -1,8 +1,8 @@
 """Inverse kinematics against a dense search: share of its branches that ``planner.ik`` finds, and time a solution.
 
 Targets are poses of the Panda's hand at random free states. The dense search descends from random states by SciPy's
-bounded least squares on Pinocchio's logarithm of the pose; a free state that it finds is found, too, where a solution
-is within the spacing of solutions, 0.1 rad in each joint. Times are those of the process. Targets are kept in
+bounded least squares on Pinocchio's logarithm of the pose; a free state of it counts as found where a solution is
+within the spacing of solutions, 0.1 rad in each joint. Times are those of the process. Targets are kept in
 benchmarks/runs/ik_branches when they are done, in order; the command resumes.
 
 Usage: python -m benchmarks.planners.ik_branches [-n 10000] [--split test] [--report]
@@ -32,6 +32,7 @@ FOLDER = RUNS / "ik_branches"
 SEEDS = {"test": 900_000, "validation": 800_000}
 ROBOT, HAND = "panda", "hand"
 STARTS = 30  # of the dense search
+STEPS = 100  # most evaluations of each descent
 COUNT = 1000  # most solutions
 REACHED = 1e-7  # largest element of the logarithm
 HEAD = (
@@ -59,7 +60,7 @@ def dense(planner: MotionPlanner, wanted: pin.SE3, rng: np.random.Generator) -> 
         return np.asarray(here @ columns[:, np.argsort(robot.state_order)])
 
     for q in robot.random_state(rng, STARTS):
-        end = least_squares(residual, q, jacobian, bounds=(limits.lower, limits.upper), xtol=1e-12, max_nfev=30)
+        end = least_squares(residual, q, jacobian, bounds=(limits.lower, limits.upper), xtol=1e-12, max_nfev=STEPS)
         if np.abs(end.fun).max() < REACHED and planner.is_free(end.x):
             found.append(end.x)
     return found
