@@ -162,7 +162,7 @@ def test_a_set_is_described_and_made_compact(made: list[Paths], tmp_path: Path, 
     done = script_here(*command, "--mib", "0.001")
     assert done.returncode == 2 and "expected a higher limit" in done.stderr
     command = ("describe_data.py", tmp_path / "c.zip")
-    done = script_here(*command, "--out", tmp_path, "--check", "5", "--motions", "1")
+    done = script_here(*command, "--out", tmp_path, "--check", "5", "--motions", "2")
     assert done.returncode == 0, done.stderr
     text = (tmp_path / "description.md").read_text()
     assert f"{len(few)} paths of {few.problems} problems" in text

@@ -48,7 +48,7 @@ def test_32_trajectories_are_memorized(few: Path, tmp_path: Path) -> None:
         "denoiser": {"width": 192, "blocks": 2},
         "condition": {"width": 64, "out": 128, "along": 3},
     }
-    trainer = Trainer(config(few, steps=600, rate=2e-3, ema=0.99, log_every=10_000, **sizes), tmp_path, HERE)
+    trainer = Trainer(config(few, steps=1000, rate=1.5e-3, ema=0.99, log_every=10_000, **sizes), tmp_path, HERE)
     trainer.run()
     model, paths = TorchModel(trainer.averaged_network(), {}), load(few)
     kernel = Kernel(RobotTables.load(DATA / "robot.npz"), scene_tables([]))
