@@ -50,7 +50,7 @@ def main() -> None:
         boxes = cache(lambda file=file: Boxes(load_robot(file), str(file)))
         mine.run(names, lambda name, boxes=boxes: boxes().problem(int(name)))
         rows[robot] = mine, names
-    figures.write("robots", rows, budget=args.budget)
+    record.write("robots", *figures.table(rows), n=args.n, budget=args.budget, **figures.SETTINGS)
 
 
 if __name__ == "__main__":

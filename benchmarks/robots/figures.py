@@ -29,6 +29,7 @@ TIMEOUT = 30.0  # of a call, by the wall clock of a machine that does other thin
 SOON = 1.0  # [s]
 SAMPLES, SEED = 2000, 7  # states of the shares
 BUDGET, JOBS = 300.0, 2  # of a preparation
+SETTINGS = {"seed": SEED, "states": SAMPLES, "limit": f"{TIMEOUT:g} s"}  # of results
 
 
 def cpu() -> float:
@@ -123,29 +124,16 @@ def add_options(parser: ArgumentParser, folder: Path) -> None:
     parser.add_argument("--folder", type=Path, default=folder, help="of robots and figures (default: %(default)s)")
 
 
-def write(name: str, rows: Mapping[str, tuple[Figures, list[str]]], **settings: Any) -> None:
-    """Write the table of some robots.
+def table(rows: Mapping[str, tuple[Figures, list[str]]]) -> tuple[dict[str, Any], str]:
+    """Return the figures of some robots, and their table.
 
     Args:
-        name: Name of the results.
         rows: Label -> figures, and the names of the problems that count.
-        **settings: Of the results.
     """
     made = [figures.row(label, names) for label, (figures, names) in rows.items()]
     both = [f"{planner}: {what}" for planner in PLANNERS for what in ("in 1 s", "CPU s p50", "p95", "length rad")]
     head = [
-        "robot",
-        "joints",
-        "pairs",
-        "free",
-        "proved",
-        "prepare CPU s",
-        "N",
-        "unsolved by both",
-        *both,
-        "unproved pairs",
-    ]
+        "robot", "joints", "pairs", "free", "proved", "prepare CPU s", "N", "unsolved by both", *both, "unproved pairs",
+    ]  # fmt: skip
     lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 2), "---"])]
-    table = "\n".join([*lines, *(record.row(cells) for _, cells in made)])
-    record.write(name, {"robots": [one for one, _ in made]}, table, seed=SEED, states=SAMPLES, limit=f"{TIMEOUT:g} s",
-                 **settings)  # fmt: skip
+    return {"robots": [one for one, _ in made]}, "\n".join([*lines, *(record.row(cells) for _, cells in made)])

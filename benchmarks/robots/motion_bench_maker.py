@@ -106,7 +106,8 @@ def main() -> None:
         mine.run(names, lambda name, found=found: found()[name])
         rows[robot] = mine, names
     left = ", ".join(f"{robot} {count}" for robot, count in refused.items())
-    figures.write("motion_bench_maker_robots", rows, budget=args.budget, refused=left)
+    settings = {"n": args.n, "budget": args.budget, "refused": left, **figures.SETTINGS}
+    record.write("motion_bench_maker_robots", *figures.table(rows), **settings)
 
 
 if __name__ == "__main__":
