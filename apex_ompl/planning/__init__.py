@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from apex_ompl.planning.inverse_kinematics import IKSolution as IKSolution
     from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
     from apex_ompl.planning.query import GoalSampler as GoalSampler
-    from apex_ompl.planning.schedule import ArmStep as ArmStep
-    from apex_ompl.planning.schedule import Schedule as Schedule
+    from apex_ompl.planning.schedules import ArmStep as ArmStep
+    from apex_ompl.planning.schedules import Schedule as Schedule
+    from apex_ompl.planning.schedules import replaced as replaced
+    from apex_ompl.planning.schedules import schedule as schedule
     from apex_ompl.planning.step_records import FoundPath as FoundPath
     from apex_ompl.planning.step_records import PlanQuery as PlanQuery
     from apex_ompl.planning.step_records import ProvedPath as ProvedPath
@@ -36,7 +38,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "inverse_kinematics": "IKResult IKSolution",
         "planner": "MotionPlanner",
         "query": "GoalSampler",
-        "schedule": "ArmStep Schedule",
+        "schedules": "ArmStep Schedule replaced schedule",
         "step_records": "FoundPath PlanQuery ProvedPath",
         "steps": "assemble check prove solve time",
         "tasks": "TaskSearch",

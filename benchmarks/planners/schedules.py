@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from apex_ompl import MotionPlanner, PoseTarget, Trajectory
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.planning.schedule import MODES, ArmStep, schedule
+from apex_ompl.planning.schedules import MODES, ArmStep, schedule
 from apex_ompl.types import Array
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically

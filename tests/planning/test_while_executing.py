@@ -13,7 +13,7 @@ from apex_ompl.errors import ApexError
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.given_motion import GivenMotion, rest, together, until_rest
 from apex_ompl.moving.motion_optimizer import MotionOptimizer
-from apex_ompl.planning.schedule import ArmStep, replaced, schedule
+from apex_ompl.planning.schedules import ArmStep, replaced, schedule
 from apex_ompl.planning.while_executing import Asked, WhileExecuting, moved_links
 from apex_ompl.result import PlanStatus
 from apex_ompl.robot import Robot
