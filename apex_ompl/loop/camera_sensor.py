@@ -57,7 +57,7 @@ class CameraSensor:
 
     def __init__(
         self, eyes: Sequence[Eye], robot: Robot, attached: Sequence[AttachedObject] = (), *, rate: float = 30.0,
-        latency: float = 0.03, error: float = 0.003, obstacles: ObstacleSettings | None = None,
+        latency: float = 0.03, error: float = 0.01, obstacles: ObstacleSettings | None = None,
         tracker: TrackerSettings | None = None, registration: RegistrationSettings | None = None,
     ) -> None:  # fmt: skip
         """Set up the finder and the tracker.
@@ -144,7 +144,7 @@ class Cameras:
     cameras: tuple[Camera, ...] = field(default_factory=lambda: default_cameras(WIDTH))
     rate: float = 30.0
     latency: float = 0.03
-    error: float = 0.003
+    error: float = 0.01
     obstacles: ObstacleSettings = field(default_factory=lambda: ObstacleSettings(low=LOW, high=HIGH))
     tracker: TrackerSettings = field(default_factory=lambda: TURNING)
     rendered: bool = False

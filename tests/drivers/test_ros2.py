@@ -127,12 +127,13 @@ def test_a_client_that_is_killed_leaves_the_robot_at_rest(robot: Robot, stand_in
     killed = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert killed.returncode == -signal.SIGKILL
     motion = motion_from(robot, robot.home, 0.4).slower(3.0)
-    time.sleep(motion.duration + 0.5)
-    times, states = stand_ins.followed()
-    late = times > times.max() - 3 * 10**8
-    assert late.sum() > 5
-    off = np.abs(states[late] - motion.positions[-1])
-    assert np.nanmax(off) <= ALIKE
+    until, off = time.monotonic() + motion.duration + 20.0, np.inf
+    while off > ALIKE and time.monotonic() < until:  # a busy machine is late
+        time.sleep(0.5)
+        times, states = stand_ins.followed()
+        late = times > times.max() - 3 * 10**8
+        off = float(np.nanmax(np.abs(states[late] - motion.positions[-1]))) if late.sum() > 5 else np.inf
+    assert off <= ALIKE
 
 
 def test_robots_that_do_not_answer_are_named(robot: Robot) -> None:
