@@ -34,7 +34,8 @@ from apex_ompl.util.validation import check_number, check_positive, check_seed
 WIDTH = 320  # of the default cameras [pixels]
 LOW, HIGH = (-0.8, -1.2, -0.05), (1.5, 1.2, 1.6)  # corners of the space beyond which no obstacle counts [m]
 SPREAD = 0.03  # by which held objects are larger, whose red pixels are no obstacle [m]
-TURNING = TrackerSettings(births=1, of=1, power=0.2, gate=25.0)  # of obstacles that may turn around between two frames
+TURNING = TrackerSettings(births=1, of=1, longest=3.0, gate=25.0, power=0.2, margin=1.0, slack=0.004)
+"""Settings of obstacles that may turn around between two frames."""
 EARLY = 1e-6  # of a frame [s]
 
 
@@ -57,7 +58,7 @@ class CameraSensor:
 
     def __init__(
         self, eyes: Sequence[Eye], robot: Robot, attached: Sequence[AttachedObject] = (), *, rate: float = 30.0,
-        latency: float = 0.03, error: float = 0.01, obstacles: ObstacleSettings | None = None,
+        latency: float = 0.03, error: float = 0.006, obstacles: ObstacleSettings | None = None,
         tracker: TrackerSettings | None = None, registration: RegistrationSettings | None = None,
     ) -> None:  # fmt: skip
         """Set up the finder and the tracker.
@@ -113,9 +114,8 @@ class CameraSensor:
             if one.name not in seen and not ((place > low) & (place < high)).all():
                 gone.append(one.name)
         errors = {one.name: self.error for one in there}
-        return Observation(
-            stamp, stamp + self.latency, tuple(one.solid for one in there), errors, tuple(dict.fromkeys(gone))
-        )
+        solids, received = tuple(one.solid for one in there), stamp + self.latency
+        return Observation(stamp, received, solids, errors, tuple(dict.fromkeys(gone)), bounds=True)
 
     def close(self) -> None:
         """Release what draws the images."""
@@ -144,7 +144,7 @@ class Cameras:
     cameras: tuple[Camera, ...] = field(default_factory=lambda: default_cameras(WIDTH))
     rate: float = 30.0
     latency: float = 0.03
-    error: float = 0.01
+    error: float = 0.006
     obstacles: ObstacleSettings = field(default_factory=lambda: ObstacleSettings(low=LOW, high=HIGH))
     tracker: TrackerSettings = field(default_factory=lambda: TURNING)
     rendered: bool = False

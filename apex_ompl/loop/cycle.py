@@ -98,6 +98,6 @@ def unexpected(tracker: Tracker, present: Iterable[Obstacle], now: float, *, nam
     tracks = (*tracker.tracks.values(), *tracker.doubted)
     for o in present:
         known = [track for track in tracks if track.shape.name == o.name or not named]
-        if not any(tracker.may_be(track, o, now) for track in known):
+        if not any(tracker.may_contain(track, o, now) for track in known):
             return True
     return False

@@ -60,6 +60,8 @@ class Observation:
             distance [m], or a covariance of the position, shape (3, 3) [m^2], of which three standard deviations along
             its longest axis count.
         gone: Names of obstacles that are not there any more.
+        bounds: Whether shapes are bounds: bodies that contain the obstacles, up to the errors, and change as more of
+            an obstacle is seen. Only bounds that are apart contradict each other, wherever their centers are.
     """
 
     stamp: float
@@ -67,6 +69,7 @@ class Observation:
     seen: tuple[Obstacle, ...]
     errors: Mapping[str, ArrayLike] = field(default_factory=dict)
     gone: tuple[str, ...] = ()
+    bounds: bool = False
 
     __repr__ = fields_line
 

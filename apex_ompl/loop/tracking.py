@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.kernel import Kernel
+from apex_ompl.loop.bounds import gap, protrusion
 from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.sensor import CUT
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
@@ -64,6 +65,7 @@ class Track:
         covariance: Covariance of position and velocity on each axis, shape (2, 2).
         seen: Number of observations since it was new or turned.
         unseen: Time for which the sensor looked and did not see it since the last observation [s].
+        bounds: Whether the shape is a bound that contains the obstacle.
         looks: Observed positions with its shape of now, the oldest first, rows of a stamp [s], a position [m], and its
             largest error, NaN for that of the settings [m].
     """
@@ -75,14 +77,18 @@ class Track:
     covariance: Array
     seen: int = 1
     unseen: float = 0.0
+    bounds: bool = False
     looks: list[tuple[float, float, float, float, float]] = field(default_factory=list)
 
     @classmethod
-    def new(cls, seen: Obstacle, stamp: float, settings: TrackSettings, error: float = math.nan) -> Track:
+    def new(
+        cls, seen: Obstacle, stamp: float, settings: TrackSettings, error: float = math.nan, *, bounds: bool = False
+    ) -> Track:  # fmt: skip
         """Start with an observation, whose largest error is NaN for that of the settings [m]."""
         spread = np.diag([_noise(settings, error) ** 2, settings.speed**2])
         looks = [(stamp, *seen.position, error)]
-        return cls(seen, stamp, np.array(seen.position, float), np.zeros(AXES), spread, looks=looks)
+        place = np.array(seen.position, float)
+        return cls(seen, stamp, place, np.zeros(AXES), spread, bounds=bounds, looks=looks)
 
     def update(self, seen: Obstacle, stamp: float, settings: TrackSettings, error: float = math.nan) -> bool:
         """Take a later observation; return False where the obstacle has turned, and the filter is reset.
@@ -99,10 +105,13 @@ class Track:
         expected = forward @ self.covariance @ forward.T + drift
         miss = np.array(seen.position, float) - (self.place + dt * self.velocity)
         spread = expected[0, 0] + noise
-        before = (
-            self.looks[1 - LOOKS :] if same_solid(seen, self.shape) else []
-        )  # a position of another shape does not bound this one
+        same = same_solid(seen, self.shape)
+        before = self.looks[1 - LOOKS :] if same else []  # a position of another shape does not bound this one
         self.shape, self.stamp, self.unseen, self.looks = seen, stamp, 0.0, [*before, (stamp, *seen.position, error)]
+        if self.bounds and not same:  # the center of another bound tells nothing of the velocity
+            self.place, self.seen = np.array(seen.position, float), self.seen + 1
+            self.covariance = np.diag([noise, expected[1, 1]])
+            return True
         if miss @ miss > GATE * spread:
             fresh = Track.new(seen, stamp, settings, error)
             self.place, self.velocity, self.covariance, self.seen = fresh.place, fresh.velocity, fresh.covariance, 1
@@ -216,7 +225,7 @@ class Tracker:
             if seen.name in observation.errors:
                 error = largest_error(observation.errors[seen.name])
             if track is None:
-                self.tracks[seen.name] = Track.new(seen, stamp, self.settings, error)
+                self.tracks[seen.name] = Track.new(seen, stamp, self.settings, error, bounds=observation.bounds)
             elif stamp > track.stamp and not self._take_place(track, seen, stamp, error):
                 way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
                 found.append(f"{seen.name} was {way:.3g} m away {stamp - track.stamp:.3g} s before")
@@ -259,7 +268,7 @@ class Tracker:
         kept = [*others, track]
         del kept[1 : 1 + max(len(kept) - MOST_DOUBTED, 0)]  # the oldest and the newest ones stay
         self.doubted = [one for one in self.doubted if one.shape.name != seen.name] + kept
-        self.tracks[seen.name] = Track.new(seen, stamp, self.settings, error)
+        self.tracks[seen.name] = Track.new(seen, stamp, self.settings, error, bounds=track.bounds)
         return False
 
     def may_be(self, track: Track, seen: Obstacle, stamp: float, error: float = 0.0) -> bool:
@@ -272,9 +281,25 @@ class Tracker:
             error: Largest error of the later place [m].
         """
         way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
+        most = self._reach(track, stamp) + error
+        return way <= most or (track.bounds and gap(track.shape, seen) <= most)
+
+    def may_contain(self, track: Track, there: Obstacle, stamp: float) -> bool:
+        """Whether an obstacle at a time [s] is where a track allows it to be.
+
+        Args:
+            track: The track.
+            there: The obstacle.
+            stamp: The time [s].
+        """
+        if not track.bounds:
+            return self.may_be(track, there, stamp)
+        return protrusion(there, track.shape) <= self._reach(track, stamp)
+
+    def _reach(self, track: Track, stamp: float) -> float:
+        """Return how far an obstacle can be at a time [s] from where a track has seen it [m]."""
         own = track.looks[-1][-1]
-        before = self.error if math.isnan(own) else own
-        return way <= before + error + self.fastest * (stamp - track.stamp) + 1e-9
+        return (self.error if math.isnan(own) else own) + self.fastest * (stamp - track.stamp) + 1e-9
 
     def _remove(self, names: Collection[str], stamp: float) -> None:
         """Remove obstacles that are not there any more at a time [s]."""

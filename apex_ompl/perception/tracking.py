@@ -16,13 +16,14 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import permutations, product
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.perception.box_axes import ROUNDING, SIZE, TURN, aligned
 from apex_ompl.perception.library import assignment
 from apex_ompl.perception.obstacles import SeenObstacle, solid_obstacle
 from apex_ompl.perception.registration import CorrectedFrame
@@ -30,20 +31,21 @@ from apex_ompl.perception.rendering import lens_of
 from apex_ompl.perception.solid_fit import KnownSize
 from apex_ompl.perception.solid_starts import Kind
 from apex_ompl.perception.surfaces import inverse
+from apex_ompl.perception.tracked_solid import next_solid
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.types import Array, Indices
+from apex_ompl.types import Array
 from apex_ompl.util.validation import check_array, check_integer, check_number, check_positive
 
 Mask = NDArray[np.bool_]
 
-TURN, PLACE, SIZE, SPEED = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+PLACE, SPEED = slice(3, 6), slice(9, 12)
 SEEN = 9  # unknowns of an observation: turn, position, lengths
 STATE = 12
 HUBER = 21.67  # squared normalized innovation of 9 dimensions that is exceeded once in 100
 LARGEST_MISFIT = 9.0  # of lengths, squared and normalized, that counts in the association
 SHORTEST = 0.01  # of a length [m]
-ROUNDING = 1e-10  # of variances of innovations, which are singular for cylinders [m^2; rad^2]
 BEHIND = 0.03  # by which a depth is behind an obstacle that is not there [m]
+PIECE = 2.0  # standard deviations within which a piece of an obstacle is inside it
 GRID = (-0.6, 0.0, 0.6)  # places in a solid that are looked through, of its half lengths
 
 
@@ -64,7 +66,8 @@ class TrackerSettings:
         view: Change of the view after which that share is renewed: distance that the camera moves in the frame of the
             obstacle, over their distance.
         margin: Standard deviations by which the solid for planners is larger.
-        slack: Length by which that solid may be larger than needed [m].
+        slack: Length by which a new solid is larger than needed; it is replaced where that is more than twice as much
+            [m].
     """
 
     births: int = 2
@@ -78,7 +81,7 @@ class TrackerSettings:
     common: float = 0.7
     view: float = 0.3
     margin: float = 2.0
-    slack: float = 0.02
+    slack: float = 0.01
 
     def __post_init__(self) -> None:
         """Check the ranges.
@@ -254,7 +257,9 @@ class ObstacleTracker:
             if i not in taken and (frame is None or _open(track, frame, robot)):
                 track.hits.append(False)
                 track.unseen += passed
-        self._tracks += [self._new(stamp, one, camera, eye) for j, one in enumerate(seen) if j not in used]
+        known = [self._tracks[i] for i in taken]
+        others = [one for j, one in enumerate(seen) if j not in used and not any(_holds(t, one) for t in known)]
+        self._tracks += [self._new(stamp, one, camera, eye) for one in others]
         self._name_and_forget()
         return tuple(self._answer(track) for track in self._tracks if track.name)
 
@@ -310,7 +315,7 @@ class ObstacleTracker:
             return math.inf
         misfit = 0.0
         if one.kind == track.kind:
-            like = _aligned(one, track)
+            like = aligned(one, track.rotation, track.size, track.covariance[:SEEN, :SEEN])
             off = like.size - track.size
             spreads = track.covariance[SIZE, SIZE] + like.covariance[SIZE, SIZE] + ROUNDING * np.eye(3)
             misfit = float(off @ np.linalg.solve(spreads, off))
@@ -353,7 +358,7 @@ class ObstacleTracker:
         self._view_from(track, camera, eye)
         same = one.kind == track.kind
         track.votes += 1 if same else -1
-        like = _aligned(one, track) if same else one
+        like = aligned(one, track.rotation, track.size, track.covariance[:SEEN, :SEEN]) if same else one
         track.observed = like
         root = _root(like.covariance)
         part = slice(0, SEEN) if same else PLACE  # of another kind, only the position counts
@@ -421,37 +426,15 @@ class ObstacleTracker:
         self._tracks, self.gone = kept, tuple(gone)
 
     def _answer(self, track: _Track) -> TrackedObstacle:
-        track.solid = self._solid(track)
+        covariance = track.covariance[:SEEN, :SEEN]
+        needed = solid_obstacle(
+            track.name, track.kind, track.pose(), track.size, covariance, deviations=self.settings.margin
+        )
+        track.solid = next_solid(track.solid, needed, self.settings.slack)
         return TrackedObstacle(
             track.name, track.kind, track.pose(), track.size.copy(), track.velocity.copy(),
             track.covariance[:STATE, :STATE].copy(), track.last, track.frames, track.observed, track.solid,
         )  # fmt: skip
-
-    def _solid(self, track: _Track) -> Obstacle:
-        """Return the solid for planners: the last one at the new position, or a new one where that does not fit."""
-        s = self.settings
-        covariance = track.covariance[:SEEN, :SEEN]
-        needed = solid_obstacle(track.name, track.kind, track.pose(), track.size, covariance, deviations=s.margin)
-        before = track.solid
-        if before is not None and (before.box is None) == (needed.box is None):
-            own, old = needed.pose[:3, :3], before.pose[:3, :3]
-            reach = np.abs(old.T @ own) @ _lengths(needed) if needed.box is not None else _lengths(needed)
-            upright = needed.box is not None or abs(own[:, 2] @ old[:, 2]) > math.cos(s.slack / _lengths(needed).max())
-            spare = _lengths(before) - reach
-            if upright and spare.min() >= 0.0 and spare.max() <= 2.0 * s.slack:
-                return before.model_copy(update={"position": needed.position})
-        x, y, z = (_lengths(needed) + s.slack / 2.0).tolist()
-        larger = {"box": (x, y, z)} if needed.box is not None else {"cylinder": {"radius": x / 2.0, "length": z}}
-        pose = {"position": needed.position, "orientation": needed.orientation}
-        return Obstacle.model_validate({"name": track.name, **larger, **pose})
-
-
-def _lengths(solid: Obstacle) -> Array:
-    """Return the lengths of a box or a cylinder along its axes, shape (3,) [m]."""
-    if solid.box is not None:
-        return np.array(solid.box)
-    assert solid.cylinder is not None
-    return np.array([2.0 * solid.cylinder.radius, 2.0 * solid.cylinder.radius, solid.cylinder.length])
 
 
 def _root(covariance: Array) -> Array:
@@ -465,40 +448,12 @@ def _view(track: _Track, eye: Array | None) -> Array | None:
     return None if eye is None else track.rotation.T @ (eye - track.place)
 
 
-def _turns() -> tuple[Indices, Array]:
-    """Return the axes of a box in another order, shape (24, 3), and these rotations, shape (24, 3, 3)."""
-    orders, turns = [], []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            turn = np.zeros((3, 3))
-            turn[list(order), range(3)] = signs
-            if np.linalg.det(turn) > 0.0:
-                orders.append(order)
-                turns.append(turn)
-    return np.array(orders), np.array(turns)
-
-
-ORDERS, TURNS = _turns()
-
-
-def _aligned(one: SeenObstacle, track: _Track) -> SeenObstacle:
-    """Return an observation with its axes in the order and with the signs that are most like those of a track."""
-    pose = one.pose.copy()
-    if one.kind == "cylinder":
-        axis, own = track.rotation[:, 2], one.pose[:3, 2]
-        turned = pin.Quaternion.FromTwoVectors(axis, own if axis @ own > 0.0 else -own).matrix()
-        pose[:3, :3] = turned @ track.rotation
-        return SeenObstacle(one.kind, pose, one.size, one.covariance, one.cut, one.points)
-    rotations, sizes = pose[:3, :3] @ TURNS, one.size[ORDERS]
-    angle = np.array([pin.log3(rotation @ track.rotation.T) for rotation in rotations])
-    spread = one.covariance[TURN, TURN] + track.covariance[TURN, TURN] + ROUNDING * np.eye(3)
-    variances = np.diag(one.covariance)[SIZE][ORDERS] + np.diag(track.covariance)[SIZE] + ROUNDING
-    distance = np.einsum("ij,ij->i", angle, np.linalg.solve(spread, angle.T).T)
-    distance += ((sizes - track.size) ** 2 / variances).sum(axis=1)
-    best = int(np.argmin(distance))
-    order = [*range(6), *(6 + ORDERS[best])]
-    pose[:3, :3] = rotations[best]
-    return SeenObstacle(one.kind, pose, sizes[best], one.covariance[np.ix_(order, order)], one.cut, one.points)
+def _holds(track: _Track, one: SeenObstacle) -> bool:
+    """Return whether half of what was seen is inside an obstacle that was seen, too: a piece of it behind an arm."""
+    points = np.array(list(product(GRID, repeat=3))) * one.size / 2.0 @ one.pose[:3, :3].T + one.pose[:3, 3]
+    margin = PIECE * np.sqrt(np.diag(track.covariance)[SIZE] + np.diag(track.covariance)[PLACE].max())
+    off = np.abs((points - track.place) @ track.rotation) <= track.size / 2.0 + margin
+    return bool(off.all(axis=1).mean() >= 0.5)
 
 
 def _open(track: _Track, frame: CorrectedFrame, robot: Mask | None) -> bool:

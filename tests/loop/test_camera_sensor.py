@@ -121,7 +121,7 @@ def test_names_of_cameras_are_their_own(kernel: Any = None) -> None:
         shape = CUBE.model_copy(update={"name": "seen_1"})
 
     class Known(Tracker):
-        def may_be(self, track: Any, seen: Obstacle, stamp: float, error: float = 0.0) -> bool:
+        def may_contain(self, track: Any, there: Obstacle, stamp: float) -> bool:
             return True
 
     tracker = Known(kernel)  # type: ignore[arg-type]

@@ -9,15 +9,18 @@ import pinocchio as pin
 import pytest
 
 from apex_ompl.errors import ParameterError
+from apex_ompl.perception.box_axes import ORDERS, TURNS
 from apex_ompl.perception.camera import Camera, DepthErrors, look_at
 from apex_ompl.perception.obstacles import SeenObstacle
 from apex_ompl.perception.registration import CorrectedFrame, Registration
 from apex_ompl.perception.solid_starts import Kind
 from apex_ompl.perception.surfaces import inverse
+from apex_ompl.perception.tracked_solid import held_back
+from apex_ompl.scene.bodies import Obstacle
 
 pytest.importorskip("scipy")
 
-from apex_ompl.perception.tracking import ORDERS, TURNS, ObstacleTracker, TrackerSettings  # noqa: E402
+from apex_ompl.perception.tracking import ObstacleTracker, TrackerSettings  # noqa: E402
 
 SIZE = np.array([0.1, 0.15, 0.2])
 TURN = pin.exp3(np.array([0.1, 0.3, 0.5]))
@@ -215,6 +218,61 @@ def test_the_solid_for_planners_holds_the_obstacle_and_seldom_changes() -> None:
         assert (np.abs(own) <= np.array(found.solid.box) / 2.0).all()
     assert len({(solid.box, solid.orientation) for solid in solids[10:]}) <= 3
     assert max(solids[-1].box or ()) < 0.2 + 0.1
+
+
+def contains(solid: Obstacle, place: np.ndarray, size: np.ndarray, turn: np.ndarray) -> bool:
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * size @ turn.T + place
+    assert solid.box is not None
+    own = (corners - solid.position) @ solid.pose[:3, :3]
+    return bool((np.abs(own) <= np.array(solid.box) / 2.0 + 1e-9).all())
+
+
+def test_the_solid_of_what_stands_does_not_move_and_shrinks_as_the_size_is_known() -> None:
+    rng, tracker = np.random.default_rng(11), ObstacleTracker(TrackerSettings(births=1, of=1, power=0.2))
+    solids, estimates = [], []
+    little, here = np.diag([0.002] * 3 + [0.002] * 3 + [0.001] * 3) ** 2, np.array([0.2, 0.0, 0.3])
+    unsure = COVARIANCE.copy()
+    unsure[6:, 6:] *= 9.0
+    for k in range(80):
+        (found,) = tracker.update(k / RATE, [seen(here, rng, covariance=unsure if k < 3 else little)])
+        solids.append(found.solid)
+        estimates.append(found.pose[:3, 3])
+        assert contains(found.solid, here, SIZE, TURN)
+    assert np.subtract(solids[0].box, SIZE).min() > 0.03 and np.subtract(solids[-1].box, SIZE).max() < 0.03
+    ways = [
+        np.linalg.norm(np.diff(rows, axis=0), axis=1).sum()
+        for rows in (estimates[40:], [o.position for o in solids[40:]])
+    ]
+    assert ways[1] < 0.3 * ways[0]
+
+
+def test_a_solid_is_held_back_no_further_than_what_it_needs() -> None:
+    rng = np.random.default_rng(12)
+    for shape in ({"box": (0.1, 0.2, 0.3)}, {"cylinder": {"radius": 0.1, "length": 0.3}}):
+        turn = pin.exp3(rng.normal(size=3))
+        x, y, z, w = pin.Quaternion(turn).coeffs()
+        before = Obstacle.model_validate({"name": "seen", **shape, "orientation": (x, y, z, w)})
+        for _ in range(50):
+            needed = before.model_copy(update={"position": tuple(rng.normal(0.0, 0.02, 3))})
+            spare = np.array([0.01, 0.01, 0.02]) if "cylinder" in shape else rng.uniform(0.0, 0.03, 3)
+            off = turn.T @ np.subtract(held_back(before, needed, spare), needed.position)
+            round_ = np.hypot(off[0], off[1]) <= spare[0] + 1e-9
+            assert (
+                (round_ and abs(off[2]) <= spare[2] + 1e-9) if "cylinder" in shape else (abs(off) <= spare + 1e-9).all()
+            )
+            if (np.abs(needed.position) < 0.004).all() and spare.min() > 0.007:
+                assert held_back(before, needed, spare) == before.position
+
+
+def test_a_piece_of_an_obstacle_is_no_other_one() -> None:
+    rng, tracker = np.random.default_rng(13), ObstacleTracker(TrackerSettings(births=1, of=1))
+    here, size = np.array([0.2, 0.0, 0.3]), np.array([0.2, 0.2, 0.2])
+    for k in range(10):
+        tracker.update(k / RATE, [seen(here, rng, size=size)])
+    piece = seen(here + TURN @ (0.06, 0.05, 0.0), rng, size=np.array([0.06, 0.08, 0.18]))
+    beside = seen(here + TURN @ (0.16, 0.0, 0.0), rng, size=np.array([0.06, 0.08, 0.18]))
+    assert len(tracker.update(10 / RATE, [seen(here, rng, size=size), piece])) == 1
+    assert len(tracker.update(11 / RATE, [seen(here, rng, size=size), beside])) == 2
 
 
 def test_bad_input_is_refused() -> None:
