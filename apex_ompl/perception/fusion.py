@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from apex_ompl.perception.held import HeldObject, turned
+from apex_ompl.perception.held import HeldObject, turned, twice
 from apex_ompl.perception.held_pixels import NOT_THERE
 from apex_ompl.perception.held_settings import HeldSettings
 from apex_ompl.perception.registration import CorrectedFrame
@@ -119,7 +119,7 @@ def _moved_along(one: Sighting, link: Array) -> HeldObject:
     """Return an object of a look where its link is now."""
     motion = link @ inverse(one.link)
     held, rotation = one.held, motion[:3, :3]
-    lever = np.kron(np.eye(2), rotation) @ held.lever
+    lever = twice(rotation) @ held.lever
     return replace(held, pose=motion @ held.pose, covariance=turned(held.covariance, rotation), lever=lever)
 
 
@@ -145,7 +145,7 @@ def _rows(one: Sighting, pose: Array, expected: Array, spread: Array) -> _Rows:
     deviations = np.maximum(
         [*[camera.angle_spread] * 3, *[camera.position_spread] * 3, camera.depth.scale_spread], 1e-6
     )  # fmt: skip
-    lever = np.kron(np.eye(2), rotation) @ one.held.lever / spread[:, None]
+    lever = twice(rotation) @ one.held.lever / spread[:, None]
     own = covariance - lever @ calibration @ lever.T
     variances, vectors = np.linalg.eigh((own + own.T) / 2.0)
     kept = variances < MEASURED

@@ -137,8 +137,8 @@ class HeldObjectFinder:
             ApexError: An object has a link that the robot does not have, or a shape without a surface.
         """
         self.robot, self.attached, self.settings = robot, tuple(attached), settings or HeldSettings()
-        for one in self.attached:
-            robot.link_frame(one.link)
+        self._links = [robot.link_frame(one.link) for one in self.attached]
+        self._data = robot.model.createData()
         self._robot = surface or RobotSurface(robot)
         self._shapes = [held_shape(one) for one in self.attached]
 
@@ -146,9 +146,10 @@ class HeldObjectFinder:
         """Return the objects as their grasps have them in a state, shape (dof,)."""
         s = self.settings
         spread = np.diag([*np.radians(s.grasp_turn), *s.grasp_shift]) ** 2
-        found = []
-        for shape in self._shapes:
-            link = self.robot.link_pose(state, shape.body.link)
+        found, data = [], self._data
+        pin.forwardKinematics(self.robot.model, data, self.robot.to_pinocchio(state))
+        for shape, frame in zip(self._shapes, self._links, strict=True):
+            link = pin.updateFramePlacement(self.robot.model, data, frame).homogeneous
             found.append(Expected(shape, link @ shape.body.pose, turned(spread, link[:3, :3])))
         return found
 
@@ -257,7 +258,7 @@ class HeldObjectFinder:
         world, pose = turned(covariance[:6, :6], camera[:3, :3]), camera @ found.best.pose
         if _far_from(one, pose):
             return _without(one, f"{one.name!r}: what is seen is not where the hand holds it", count)
-        lever = np.kron(np.eye(2), camera[:3, :3]) @ found.lever[:6]
+        lever = twice(camera[:3, :3]) @ found.lever[:6]
         return HeldObject(
             one.shape.body, "", pose, world, found.best.scale, size, share, count, found.misfit, lever
         )  # fmt: skip
@@ -271,8 +272,15 @@ def _far_from(one: Expected, pose: Array) -> bool:
 
 def turned(covariance: Array, rotation: Array) -> Array:
     """Return the covariance of a turn and a shift, shape (6, 6), in axes that a rotation, shape (3, 3), turns."""
-    both = np.kron(np.eye(2), rotation)
+    both = twice(rotation)
     return np.asarray(both @ covariance @ both.T)
+
+
+def twice(rotation: Array) -> Array:
+    """Return the matrix that turns a turn and a shift alike, shape (6, 6)."""
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = rotation
+    return both
 
 
 def _without(one: Expected, reason: str, count: int = 0) -> HeldObject:

@@ -25,6 +25,7 @@ ALONE = 0.33  # share of the contour's measurements in one frame, in which depth
 STEPS = 4, 3  # from each start, and in a round of what was found from there
 ROUNDS = 3  # at most
 SETTLED = 0.3  # squared change in a round, in units of its covariance, below which a fit has settled
+LITTLE = 5e-5  # shift of a step that is the last one of a fit [m]
 TUKEY = 3.3  # standard deviations of a point from which it does not count in the end
 LAST = 0.018  # residual from which points do not count in fits from the starts [m]
 SAME_FIT = 9.0, 0.1  # squared difference of fits in units of their own and of grasps' spread within which they are one
@@ -168,7 +169,7 @@ class HeldFit(NamedTuple):
             noise=self.seen.noise, floor=s.floor, edge=s.edge,
             point_share=pixels.stands_for * self.share(pixels.points) / max(1, len(pixels.points)),
             contour_share=s.contour_share * (ALONE if self._alone else 1.0) * window.stride / self._inflation,
-            first=cutoff or FIRST, last=cutoff or LAST, reach=REACH, steps=steps,
+            first=cutoff or FIRST, last=cutoff or LAST, reach=REACH, steps=steps, settled=LITTLE,
         )  # fmt: skip
         return fit_surface(
             np.vstack([pixels.points, OUTSIDE]), pixels.beyond, self.around.lens, shape.surface.vertices,

@@ -186,11 +186,12 @@ def corrected(
     camera, state = frame.camera, frame.state(surface.robot.joint_names)
     noise = camera.depth.noise / float(np.sqrt(frames))
     depth = resampled(frame.depth, undistorted(camera)) * camera.depth.scale
-    depth = np.where(depth >= camera.depth.nearest, depth, 0.0)
+    depth *= depth >= camera.depth.nearest
     spreads = [camera.angle_spread] * 3 + [camera.position_spread] * 3 + [camera.depth.scale_spread]
     reported = Registration(camera.pose_at(surface.robot, state), 1.0, state, np.diag(spreads) ** 2, 0, 0)
     given = CorrectedFrame(camera, depth, reported, noise)
     if settings is None:
         return given
     found = register(given, surface, settings)
-    return CorrectedFrame(camera, depth * found.scale, found, noise)
+    depth *= found.scale
+    return CorrectedFrame(camera, depth, found, noise)
