@@ -73,7 +73,7 @@ class Commands:
         self._check(motion)
         self._check_start(motion, at)
         if measured is not None and self._bounds is not None:
-            self._check_measured(motion, at, measured, self._bounds.start)
+            self._check_measured(motion, at, measured, self._bounds)
         self.add(motion, at)
 
     def add(self, motion: Trajectory, at: float) -> None:
@@ -187,10 +187,15 @@ class Commands:
                 found = f"a {name} of {self.names[k]} that is {off[k]:.3g} from the commanded one"
                 raise ParameterError("motion", found, f"a start within {most[k]:.3g} of it at {at:g} s")
 
-    def _check_measured(self, motion: Trajectory, at: float, measured: DriverState, most: Array) -> None:
-        """Check that a motion starts where the robot is: off by what it is off now, which it carries along."""
-        commanded = self.states(np.array([measured.stamp, max(at, measured.stamp)]))[0]
+    def _check_measured(self, motion: Trajectory, at: float, measured: DriverState, bounds: Bounds) -> None:
+        """Check that a motion starts where the robot is: off by what it is off now, which it carries along.
+
+        A robot that moves may be off as far as it may while it follows a motion.
+        """
+        commanded, speeds = self.states(np.array([measured.stamp, max(at, measured.stamp)]))[:2]
         off = np.abs(motion.positions[0] - commanded[1] - (measured.positions - commanded[0]))
+        moves = (np.abs(speeds) > AT_REST).any()
+        most = np.maximum(bounds.start, bounds.tracking) if moves else bounds.start
         if not (off <= most).all():
             k = int(np.argmax(off / most))
             where = f"{self.names[k]} is {off[k]:.3g} off the start of the motion"

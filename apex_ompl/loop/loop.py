@@ -28,7 +28,7 @@ from apex_ompl.loop.result import Event, Outcome
 from apex_ompl.moving.context import SAME_TIME, Following
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.replanner import Replanner
-from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.moving.settings import FOLLOWED, LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.planning.world import CloudFiles
 from apex_ompl.scene.bodies import Obstacle
@@ -106,7 +106,7 @@ class Loop:
         if not isinstance(settings, LoopSettings):
             raise ParameterError("settings", settings, "a LoopSettings")
         replanning = method_of(method)
-        used = replace(settings, **replanning.settings)
+        used = replace(settings.completed(still_margin=FOLLOWED), **replanning.settings)
         with quiet_ompl():
             seed_ompl(seed)
             context = context_of(problem, used, speed, seed)

@@ -31,7 +31,7 @@ from apex_ompl.loop.sensor import Sensor, SensorStream
 from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import Replanner
-from apex_ompl.moving.settings import LoopSettings
+from apex_ompl.moving.settings import FOLLOWED, LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
 from apex_ompl.robot.model import Robot, digest
 from apex_ompl.scene.problem import Problem
@@ -70,6 +70,7 @@ def run_in(
     if is_factory(sensor) and driver is None:
         raise ParameterError("driver", None, "a driver, whose robot the sensor sees")
     settings = _completed(settings or LoopSettings(), sensor, environment)
+    settings = settings if driver is None else settings.completed(still_margin=FOLLOWED)
     check_number(tolerance, "tolerance", 0.0, np.pi)
     used = replace(replace(settings, prediction=prediction), **replanning.settings)
     environment.ran = True
@@ -140,7 +141,7 @@ def _completed(
     """
     largest = getattr(sensor, "largest_error", None)
     if largest is not None:  # of a simulated sensor
-        return settings.completed(largest, environment.fastest)
+        return settings.completed(error=largest, fastest=environment.fastest)
     if not callable(getattr(sensor, "read", None)) and not is_factory(sensor):
         raise ParameterError("sensor", sensor, "a Sensor, an object with read(now), or a function that makes one")
     missing = [name for name in ("error", "fastest") if getattr(settings, name) is None]

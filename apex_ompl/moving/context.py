@@ -25,6 +25,7 @@ from apex_ompl.types import Array
 
 SAME_TIME = 1e-9  # [s]
 GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
+LIKE_ENDS = 0.5  # share of the clearance at its start or end that a motion keeps, where that is below the margin
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,23 +162,37 @@ class RunContext:
     def is_clear(self, curve: Curve, budget: ComputeBudget | None = None) -> bool:
         """Whether a curve is proved clear of static obstacles and of self-collision.
 
-        Its clearance is ``GRAZING`` or more, unless it starts with less: pieces of it are proved again at joining.
+        Its clearance is ``GRAZING`` or more, as far as states show it, and ``settings.still_margin`` or more, or not
+        much less than where it starts or ends. One that starts with less than ``GRAZING`` has any: pieces of a motion
+        are proved again at joining.
         """
-        proof = self.checker.prove(curve, tolerance=0.0)
+        proof, margin = self.checker.prove(curve, tolerance=0.0), self.settings.still_margin
         if budget is not None:
             budget.spend("proof interval", proof.intervals)
             budget.spend("exact proof", int(proof.by_spheres < 1.0))
-        return bool(proof) and (proof.clearance >= GRAZING or self._touches(curve.states[0]))
+        if not proof:
+            return False
+        if proof.clearance < GRAZING and self._clearance(curve.states[0]) >= GRAZING:
+            return False
+        return margin is None or self._keeps_away(curve, margin)
 
     def line_is_clear(self, first: Array, last: Array, budget: ComputeBudget | None = None) -> bool:
         """Whether the straight motion between two states, shape (dof,), is clear by :meth:`is_clear`."""
         return self.is_clear(Curve.polyline(np.stack([first, last])), budget)
 
-    def _touches(self, q: Array) -> bool:
-        """Whether the clearance at a state, shape (dof,), is below ``GRAZING``."""
+    def _keeps_away(self, curve: Curve, margin: float) -> bool:
+        """Whether a curve keeps a distance [m] from static obstacles and own parts, or half of that at its ends."""
+        least = self.checker.prove(curve, tolerance=0.5 * margin).clearance_bound
+        if least >= margin:
+            return True
+        ends = [self._clearance(q, 0.1 * margin) for q in (curve.states[0], curve.states[-1])]
+        return least >= LIKE_ENDS * min(margin, *ends)
+
+    def _clearance(self, q: Array, tolerance: float = 0.0) -> float:
+        """Return the clearance at a state, shape (dof,), 0 where it is not free [m]."""
         states, still = np.stack([q, q]), np.zeros((2, len(q)))
-        proof = self.checker.prove(Curve.cubic(np.array([0.0, 1.0]), states, still, still), tolerance=0.0)
-        return not proof or proof.clearance < GRAZING
+        proof = self.checker.prove(Curve.cubic(np.array([0.0, 1.0]), states, still, still), tolerance=tolerance)
+        return proof.clearance if proof else 0.0
 
     def keeps_limits(self, motion: Trajectory) -> bool:
         """Whether a motion keeps the limits."""

@@ -58,6 +58,24 @@ def pushed(request: pytest.FixtureRequest, robot: Robot) -> Callable[[Guard], Pu
     return lambda guard: Pushed(request.param, robot, guard)
 
 
+def test_a_robot_that_moves_may_be_off_at_a_handover_as_far_as_when_it_follows(
+    pushed: Callable[[Guard], Pushed],
+) -> None:
+    for tracking, refused in ((0.05, False), (0.004, True)):
+        tried = pushed(Guard(start=0.003, tracking=tracking))
+        first = tried.motion((0, 0.9))
+        tried.driver.send(first, 0.0)
+        tried.push(JOINT, 0.008, 28.0)
+        tried.driver.advance(0.2)
+        assert float(np.abs(tried.driver.state().positions - first(0.2))[JOINT]) > 0.004
+        if refused:
+            assert "off its commanded position" in tried.driver.fault
+        else:
+            tried.driver.send(first.after(0.25), 0.25)
+            tried.driver.advance(0.26)
+            assert not tried.driver.fault and tried.driver.end > 0.3
+
+
 def test_a_start_off_the_measured_position_is_refused(pushed: Callable[[Guard], Pushed]) -> None:
     tried = pushed(Guard(start=0.003))
     tried.push(JOINT, 0.008, 28.0)

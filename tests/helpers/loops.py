@@ -74,7 +74,7 @@ def context_of(name: str, *, speed: float = 1.0, **parameters: Any) -> RunContex
     limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
     kinds = ("velocity", "acceleration", "jerk")
     limits = replace(limits, **{kind: share * getattr(limits, kind) for kind in kinds})
-    settings = LoopSettings(**{"timeout": 3.0, "hastens": False, **parameters}).completed(0.024, 0.4)
+    settings = LoopSettings(**{"timeout": 3.0, "hastens": False, **parameters}).completed(error=0.024, fastest=0.4)
     return RunContext(setup, limits, limits, settings)
 
 
