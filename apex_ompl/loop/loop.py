@@ -195,7 +195,7 @@ class Loop:
 
     def observe(
         self, stamp: float, objects: Iterable[Obstacle] = (), *, errors: Mapping[str, ArrayLike] | None = None,
-        clouds: Mapping[str, ArrayLike] | None = None, radius: float = POINT_RADIUS,
+        clouds: Mapping[str, ArrayLike] | None = None, radius: float = POINT_RADIUS, bounds: bool = False,
     ) -> None:  # fmt: skip
         """Take an observation of obstacles that move, or may; may be called from any thread.
 
@@ -217,6 +217,8 @@ class Loop:
                 obstacles: each point of an obstacle that may touch the robot before the next cloud is within
                 ``radius`` and ``settings.error`` of one. Without points, nothing is there.
             radius: Radius of the balls around the points of clouds [m].
+            bounds: Whether shapes are bounds that contain the obstacles and change as more of them is seen
+                (:class:`apex_ompl.loop.Observation`).
 
         Raises:
             ParameterError: The stamp is no number, an object is no Obstacle, errors or clouds are not given by name, or
@@ -235,7 +237,7 @@ class Loop:
             found = {name: self._cloud(name, points, radius) for name, points in (clouds or {}).items()}
             bodies = tuple(body for body in found.values() if body is not None)
             gone = tuple(name for name, body in found.items() if body is None)
-            self._waiting.append(Observation(at, at, (*seen, *bodies), dict(errors or {}), gone))
+            self._waiting.append(Observation(at, at, (*seen, *bodies), dict(errors or {}), gone, bounds))
 
     def _cloud(self, name: str, points: ArrayLike, radius: float) -> Obstacle | None:
         """Return the obstacle of a cloud, in the files that a planner process reads; None without points.

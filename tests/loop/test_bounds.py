@@ -7,9 +7,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+from commanded import SETTINGS, ZERO
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from loops import PROBLEM, ByHand, line
 
+from apex_ompl import Loop, problems
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.loop.bounds import gap, protrusion
 from apex_ompl.loop.cycle import unexpected
@@ -123,3 +126,14 @@ def test_a_bound_that_moves_has_a_velocity() -> None:
     for k in range(40):
         known.take(wall(0.1, k / 30.0, x=0.5 + 0.15 * k / 30.0))
     assert known.tracks["seen"].velocity == pytest.approx([0.15, 0.0, 0.0], abs=1e-3)
+
+
+def test_a_loop_takes_bounds() -> None:
+    def doubted(loop: Loop) -> int:
+        return sum(event.kind == "place doubted" for event in loop.events)
+
+    with Loop(problems.load(PROBLEM), ByHand(line), settings=SETTINGS, process=False) as loop:
+        for k, (seen, more) in enumerate(((wall(0.3, 0.0), 0), (wall(0.12, 0.0), 0), (wall(0.12, 0.0, x=0.9), 1))):
+            loop.observe(ZERO + 0.01 * k, seen.seen, bounds=True)
+            loop.step(ZERO + 0.01 * k)
+            assert doubted(loop) == more
