@@ -255,8 +255,17 @@ def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[st
 def _bounds(robot: Robot, start: Array, held: NDArray[np.intp]) -> Bounds:
     """Return the robot's limits, narrowed to the start for joints that stay, to a turn to either side if continuous."""
     lower, upper = robot.range_around(start, turns=1.0)
-    lower[held] = np.maximum(lower[held], start[held] - HELD_WIDTH)
-    upper[held] = np.minimum(upper[held], start[held] + HELD_WIDTH)
+    return held_range(lower, upper, start, held)
+
+
+def held_range(lower: Array, upper: Array, start: Array, held: NDArray[np.intp]) -> Bounds:
+    """Return limits of joints, shape (dof,) each, narrowed to the start for joints that stay.
+
+    A joint that is outside its limits at the start, which is a fault, has a narrow range at the limit.
+    """
+    at = start[held].clip(lower[held], upper[held])
+    lower, upper = lower.copy(), upper.copy()
+    lower[held], upper[held] = np.maximum(lower[held], at - HELD_WIDTH), np.minimum(upper[held], at + HELD_WIDTH)
     return lower, upper
 
 

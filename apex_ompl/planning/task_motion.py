@@ -11,7 +11,6 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.planning.superposition import superposed
 from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner, timing_in
 from apex_ompl.planning.task_world import TaskWorld
@@ -29,6 +28,7 @@ from apex_ompl.scene.steps import (
     TogetherStep,
 )
 from apex_ompl.timing import Timing, Trajectory
+from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.trajectory import ROUNDING, joined
 from apex_ompl.types import Array
 

@@ -15,10 +15,9 @@ from apex_ompl.constraints.line import SAME_POINT
 from apex_ompl.errors import SceneError, TimingError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.path import Path
+from apex_ompl.paths.path import Path, abreast
 from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
-from apex_ompl.planning.superposition import abreast, superposed
 from apex_ompl.planning.task_constraints import StepConstraints
 from apex_ompl.planning.task_waypoints import StepFailed, held_pose, waypoints
 from apex_ompl.planning.task_world import TaskWorld
@@ -38,6 +37,7 @@ from apex_ompl.scene.steps import (
     WaitStep,
 )
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length

@@ -17,12 +17,13 @@ from tasks import contacts, poses
 from apex_ompl import ApexError, MotionPlanner, PoseTarget, TaskResult, load_robot, plan_task
 from apex_ompl.cli.parser import main
 from apex_ompl.goals.grasp_goal import MOST, pose_alternatives
+from apex_ompl.paths.path import abreast
 from apex_ompl.planning import TaskSearch
-from apex_ompl.planning.superposition import abreast, superposed
 from apex_ompl.planning.task_result import load_result
 from apex_ompl.problems import cells
 from apex_ompl.scene import Goal, Problem
 from apex_ompl.timing import Trajectory, time_path
+from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.rests import is_at_rest
 from apex_ompl.types import Array
 

@@ -16,7 +16,7 @@ import torch
 import trimesh
 from planning import EXACT, within
 
-from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan, points_from_depth
+from apex_ompl import Alignment, AnyOf, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan, points_from_depth
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.conservative import ConservativeChecker
 from apex_ompl.collision.scene_bodies import SceneBodies
@@ -27,6 +27,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Trajectory
+from apex_ompl.timing.combination import rest
 
 POST = {"name": "post", "box": (0.1, 0.1, 0.6), "position": (0.45, 0.0, 0.3)}
 
@@ -341,6 +342,28 @@ def test_a_group_moves_while_the_other_joints_stay(name: str, planner: MotionPla
     assert np.abs(result.trajectory.positions[:, stays] - start[stays]).max() < 1e-12
     assert result.held_joints == tuple(robot.joint_names[k] for k in stays)
     assert full_check(CollisionChecker(robot, [Obstacle(**POST)]), result.path, start)
+
+
+def test_of_a_pose_by_name_the_joints_of_the_group_count(planner: MotionPlanner, robot: Robot) -> None:
+    start = robot.home.copy()
+    start[[0, 7]] += 0.3
+    states = [
+        planner.plan(start, goal, group="left_arm").path.states[-1] for goal in ("home", ["home"], AnyOf(["home"]))
+    ]
+    task = planner.sequence(start, [{"kind": "move", "goal": "home", "group": "left_arm"}])
+    assert task, task.reason
+    for end in (*states, task.trajectory.positions[-1]):
+        assert end[0] == robot.home[0] and end[7] == start[7]
+
+
+def test_a_joint_that_stays_outside_of_its_limits_is_an_invalid_start(planner: MotionPlanner, robot: Robot) -> None:
+    start = robot.home.copy()
+    start[10] = 5.0
+    goal = dict(zip(robot.joint_names[:7], robot.home.tolist(), strict=False))
+    still = rest(np.zeros(1), 1.0, ["right_hand_synergy"])
+    for options in ({}, {"while_executing": still}):
+        result = planner.plan(start, goal, group="left_arm", **options)
+        assert result.status is PlanStatus.INVALID_START and "right_joint4 = 5 is outside" in result.reason
 
 
 def test_a_start_a_little_outside_of_its_limits_stays_where_it_is_moved_to(
