@@ -260,11 +260,26 @@ class StepPlanner:
         lefts, use = [plan.left for plan in plans if not isnan(plan.left)], dict[str, float]()
         for plan in plans:
             use = {name: max(use.get(name, 0.0), share) for name, share in (use | dict(plan.use)).items()}
+        if motion is not None and timing is not None:
+            use |= self._kept_together(during, timing, motion)
         left = nan if not lefts else max(lefts) if motion is not None else float(len(path.states) - 1)
         return StepPlan(
             step, during, after, path, motion, check.proof.clearance, left, use,
             max(plan.deviation for plan in plans),
         )  # fmt: skip
+
+    def _kept_together(self, world: TaskWorld, timing: Timing, motion: Trajectory) -> dict[str, float]:
+        """Return the shares of limits of torques and tool speeds, where joints of one arm may move in several steps.
+
+        Raises:
+            StepFailed: One is exceeded.
+        """
+        more = timing_in(world, timing).motion_limits(self.robot, tuple(world.held.values()), self.problem.payload)
+        if more is None:
+            return {}
+        if fault := more.fault(motion):
+            raise StepFailed(fault, "limits of torques or tool speeds")
+        return more.use(motion)
 
     def _closed(self, during: TaskWorld, step: GraspStep, q: Array) -> float:
         """Return the synergy at which a hand is just before contact with its object.

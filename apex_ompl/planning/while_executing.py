@@ -151,7 +151,9 @@ class WhileExecuting(InTime):
         return MotionOptimizer(kernel, DynamicObstacles(()), self.limits, given=self.given.values)
 
     def accepts(self, motion: Trajectory) -> bool:
-        """Whether the motion of all joints is proved."""
+        """Whether the motion of all joints is proved, and that of the planned ones keeps all limits."""
+        if self.is_over(motion):
+            return False
         both = self.given.combined(motion)
         if not self.checker.are_free(both(np.linspace(0.0, both.duration, SAMPLES))).all():
             return False
@@ -194,8 +196,8 @@ class WhileExecuting(InTime):
         solved_by = f"{still.solved_by}+{method}" if method else still.solved_by
         exact = FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(states), solved_by, check.proof)
         return replace(
-            exact.result(), problem=self.problem, trajectory=both, limit_use=both.use(setup.robot.limits),
-            timing_method=method or still.timing_method, motion_clearance=proved.proof.clearance,
+            exact.result(), problem=self.problem, trajectory=both,
+            limit_use=self.use(motion) | both.use(setup.robot.limits), timing_method=method or still.timing_method, motion_clearance=proved.proof.clearance,
             deviation=deviation, **kept,
         )  # fmt: skip
 

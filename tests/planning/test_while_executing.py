@@ -342,3 +342,22 @@ def test_what_waits_for_a_replaced_step_still_does(planner: MotionPlanner) -> No
     ):
         with pytest.raises(ApexError, match=words):
             replaced(planner, schedules, group, new)  # type: ignore[arg-type]
+
+
+def test_motions_beside_another_keep_the_limits_of_torques_and_tools(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]]
+) -> None:
+    """Retimed motions and those in space and time, too: by inverse dynamics of the own arm alone."""
+    robot = planner.robot
+    start = {name: value for name, value in zip(robot.joint_names, robot.home.tolist(), strict=True)}
+    start = {name: value for name, value in start.items() if "right_joint" not in name}
+    for timing in (Timing(torque_scale=0.4), Timing(max_tool_speed={"left_hand": 0.8})):
+        result = planner.plan(
+            start, reached["left"], group="left_arm", while_executing=there_and_back, timing=timing, timeout=20.0
+        )
+        assert result and result.trajectory is not None, result.reason
+        limits, states = timing.motion_limits(robot), result.trajectory
+        alone = GivenMotion.of(robot, states.selected(robot.joint_names[:7])).combined(
+            rest(robot.home, states.duration, robot.joint_names)
+        )
+        assert limits is not None and max(limits.use(alone).values()) <= 1.0
