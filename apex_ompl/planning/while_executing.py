@@ -196,8 +196,8 @@ class WhileExecuting(InTime):
         solved_by = f"{still.solved_by}+{method}" if method else still.solved_by
         exact = FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(states), solved_by, check.proof)
         return replace(
-            exact.result(), problem=self.problem, trajectory=both,
-            limit_use=self.use(motion) | both.use(setup.robot.limits), timing_method=method or still.timing_method, motion_clearance=proved.proof.clearance,
+            exact.result(), problem=self.problem, trajectory=both, timing_method=method or still.timing_method,
+            limit_use=self.use(motion) | both.use(setup.robot.limits), motion_clearance=proved.proof.clearance,
             deviation=deviation, **kept,
         )  # fmt: skip
 
