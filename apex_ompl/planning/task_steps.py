@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.line import SAME_POINT
+from apex_ompl.constraints.line_ends import LineEnd
 from apex_ompl.errors import SceneError, TimingError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.ompl.validity import full_check
@@ -189,7 +190,8 @@ class StepPlanner:
         query = self.line_query(world, step, q, timing)
         found = plan_along(self.checker, query, self._deadline, self._ends)
         if not found or found.path is None:
-            raise StepFailed(found.reason, " ".join((f"{found.end}", *found.blocked_by)))
+            cause = "" if found.end is LineEnd.REACHED else " ".join((f"{found.end}", *found.blocked_by))
+            raise StepFailed(found.reason, cause)
         path = found.path
         if not np.array_equal(path.states[0], q):
             raise StepFailed("the line does not start in the state before it")

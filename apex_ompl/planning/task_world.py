@@ -16,6 +16,7 @@ from apex_ompl.constraints.frames import LinkFace, frame_of
 from apex_ompl.errors import ApexError, FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.planning.line_query import tools_of
+from apex_ompl.planning.query import planned_joints
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
@@ -220,15 +221,31 @@ def check_steps(robot: Robot, problem: Problem) -> None:
         for name, value, expected in _faults(world, step):
             raise FileFormatError(problem.source, f"after.{k}.{name}", value, expected)
         if isinstance(step, MoveStep):
-            moved = world.problem(problem, step.goal, q)
-            try:
-                workspace_goal(robot, moved)
-                moved.goal_states(robot.joint_names)
-            except ApexError as error:
-                raise FileFormatError(
-                    problem.source, f"after.{k}.goal", str(error), "expected a possible goal"
-                ) from None
+            _check_move(world, problem, step, q, f"after.{k}")
         world = world.after(step, q)
+
+
+def _check_move(world: TaskWorld, problem: Problem, step: MoveStep, q: Array, field: str) -> None:
+    """Check the goal of a motion, and its joints.
+
+    Raises:
+        FileFormatError: One is unknown or faulty; the message names the step.
+    """
+    robot, source = world.robot, problem.source
+    moved = world.problem(problem, step.goal, q)
+    try:
+        workspace_goal(robot, moved)
+        moved.goal_states(robot.joint_names)
+    except FileFormatError as error:
+        raise FileFormatError(source, f"{field}.{error.field}", error.value, error.expected) from None
+    except ApexError as error:
+        expected = f"expected a possible goal ({error})"
+        raise FileFormatError(source, f"{field}.goal", step.title, expected) from None
+    try:
+        planned_joints(robot, step.group or robot.joint_names)
+    except UnknownNameError as error:
+        expected = f"expected names of groups and joints ({error})"
+        raise FileFormatError(source, f"{field}.group", error.name, expected) from None
 
 
 def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]]:

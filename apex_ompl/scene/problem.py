@@ -26,7 +26,17 @@ from pydantic import (
 )
 
 from apex_ompl.errors import FileFormatError, ParameterError, nearest_name
-from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located, pose_matrix
+from apex_ompl.scene.bodies import (
+    AttachedObject,
+    BodyPair,
+    Mass,
+    Name,
+    Obstacle,
+    Quaternion,
+    Vector,
+    located,
+    pose_matrix,
+)
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
 from apex_ompl.scene.steps import AllowStep, MotionStep, Names, SimultaneousStep, TogetherStep
 from apex_ompl.types import Array
@@ -348,7 +358,7 @@ class Problem(StrictModel):
     scene: tuple[Obstacle, ...] = ()
     attached: tuple[AttachedObject, ...] = ()
     payload: dict[Name, Mass] = {}
-    allowed: tuple[tuple[str, str], ...] = ()
+    allowed: tuple[BodyPair, ...] = ()
     start: JointValues
     goal: Goal
     constraints: tuple[AnyConstraint, ...] = ()

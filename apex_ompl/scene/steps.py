@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from apex_ompl.scene.bodies import Coordinate, Direction, Name, Size
+from apex_ompl.scene.bodies import BodyPair, Coordinate, Direction, Name, Size
 from apex_ompl.util.schema import StrictModel
 
 LONGEST_WAIT = 3600.0  # [s]
@@ -301,7 +301,7 @@ class AllowStep(Step):
     """
 
     kind: Literal["allow"] = "allow"
-    pairs: Annotated[tuple[tuple[Name, Name], ...], Field(min_length=1)]
+    pairs: Annotated[tuple[BodyPair, ...], Field(min_length=1)]
     contact: bool = True
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 from planning import cached_problem
 from tasks import contacts, poses
 
-from apex_ompl import ApexError, MotionPlanner, PoseTarget, TaskResult, load_robot, plan_task
+from apex_ompl import ApexError, MotionPlanner, PlanStatus, PoseTarget, TaskResult, load_robot, plan_task
 from apex_ompl.cli.parser import main
 from apex_ompl.goals.grasp_goal import MOST, pose_alternatives
 from apex_ompl.paths.path import abreast
@@ -235,8 +236,20 @@ def test_grasps_are_poses_of_the_hand_where_the_object_is() -> None:
         ({"kind": "attach", "object": "box", "link": "foot"}, "expected a hand or a link of the robot"),
         ({"kind": "detach", "object": "box"}, "expected a held object: there is none"),
         ({"kind": "allow", "pairs": [["box", "wall"]]}, "expected links of the robot, or: box"),
-        ({"kind": "together", "steps": [{"kind": "wait", "seconds": 1.0}]}, "after.0.steps"),
+        ({"kind": "allow", "pairs": [["box", "box"]]}, "after.0.pairs.0: the body 'box' is not checked against itself"),
+        ({"kind": "allow", "pairs": []}, "after.0.pairs: expected 1 item or more, got []"),
+        ({"kind": "allow", "pairs": "box"}, "after.0.pairs: expected a list, got 'box'"),
+        ({"kind": "together", "steps": [{"kind": "wait", "seconds": 1.0}]}, "after.0.steps: expected 2 items or more"),
+        ({"kind": "line", "frame": ["hand", "hand", 3], "by": (0, 0, 1)}, "after.0.frame.2: "),
         ({"kind": "move", "goal": "hme"}, "did you mean 'home'"),
+        (
+            {"kind": "move", "goal": {"joints": {"joint1": 0.0}}, "blend": 0.1},
+            "after.0.goal.joints: unknown joint, did you mean",
+        ),
+        (
+            {"kind": "move", "blend": 0.1, "goal": {"alignment": {"kind": "pour", "first": "cup", "second": "box"}}},
+            "after.0.goal: expected a possible goal (unknown held object in goal.alignment 'cup'",
+        ),
         ({"kind": "line", "frame": "hand", "by": (0, 0, 0.1), "blend": -1.0}, "after.0.blend"),
         (7, "steps[0]: expected a step such as"),
     ],
@@ -247,6 +260,42 @@ def test_faulty_steps_are_named(step: Any, words: str) -> None:
         with pytest.raises(ApexError) as raised:
             planner.sequence("home", [step])
         assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["sequence", "plan"])
+def test_faulty_files_are_refused_in_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """Exit code 2, and nothing is planned before the fault of a later step is found."""
+    home, wait = {"joints": "home"}, {"kind": "wait", "seconds": 1.0}
+    for fields, words in (
+        ({"goal": home, "allowed": [["box", "box"]]}, "allowed.0: the body 'box' is not checked against itself"),
+        ({"goal": "home"}, "goal: expected a mapping of keys to values, got 'home'"),
+        ({"goal": {"any_of": []}}, "goal.any_of: expected 1 item or more"),
+        ({"after": wait}, "after: expected a list, got"),
+        ({"after": [wait, None]}, "after.1: expected a mapping of keys to values, got None"),
+        ({"after": [wait, {"kind": "allow", "pairs": [["box", "box"]]}]}, "after.1.pairs.0: the body 'box'"),
+        ({"after": [wait, {"kind": "move", "goal": home, "group": "legs"}]}, "after.1.group: expected names of groups"),
+    ):
+        if kind == "plan" and "legs" in str(fields):
+            continue  # which plans to the goal alone
+        box = {"name": "box", "box": [0.05, 0.05, 0.1], "position": [0.5, -0.2, 0.3]}
+        head = {"schema": "apex-ompl/problem/1", "name": "x", "robot": "panda", "start": "home", "scene": [box]}
+        (tmp_path / "x.yaml").write_text(json.dumps(head | fields))
+        assert main([kind, str(tmp_path / "x.yaml")]) == 2
+        told = capsys.readouterr()
+        assert words in told.err and told.err.count("\n") == 1 and not told.out
+
+
+def test_a_line_that_would_take_hours_is_refused_at_once() -> None:
+    """Its motion would have more states than there is memory for."""
+    with MotionPlanner("panda") as planner:
+        started = time.process_time()
+        task = planner.sequence("home", [{"kind": "line", "frame": "hand", "by": (0, 0, 0.1), "speed": 1e-8}])
+        line = planner.plan_line("home", (0.5, 0.0, 0.5), frame="hand", speed=1e-8)
+        assert time.process_time() - started < 5.0
+    assert "more than 3600 s" in task.reason and task.status is PlanStatus.STEP_FAILED
+    assert "more than 3600 s" in line.reason and line.status is PlanStatus.TIMING_FAILED
 
 
 def test_a_sequence_is_planned_from_its_file_saved_and_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
