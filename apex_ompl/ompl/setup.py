@@ -14,6 +14,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample, sample_on_constraints
@@ -214,8 +215,11 @@ def constraint_set(
         held: Numbers of the joints that stay as at the start.
 
     Raises:
+        ParameterError: ``constraints`` is no list.
         ApexError: A frame is unknown, or no planned joint moves it.
     """
+    if not isinstance(constraints, (list, tuple)):
+        raise ParameterError("constraints", constraints, "a list of constraints")
     if not (problem.constraints or constraints or any(one.links is not None for one in problem.attached)):
         return None
     from apex_ompl.constraints import paths  # noqa: F401 - which searches need: a fork waits for what is imported here

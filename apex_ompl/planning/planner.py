@@ -174,10 +174,11 @@ class MotionPlanner:
         Raises:
             ApexError: The problem, the planner, a parameter or the name of an option is faulty.
         """
-        from apex_ompl.planning.query import check_is_no_line
+        from apex_ompl.planning.query import check_is_no_line, check_problem
 
         started = time.perf_counter()
         check_options(options, OPTIONS)
+        check_problem(problem)
         check_is_no_line(problem)
         with running(), self._lock:
             with unforked():
@@ -196,7 +197,7 @@ class MotionPlanner:
         Args:
             start: The start.
             steps: The steps: records of :mod:`apex_ompl.scene`, or entries of ``after`` in problem files. The goal of a
-                ``move`` may be any goal of :meth:`plan`.
+                ``move`` may be any goal of :meth:`plan` but an object that draws states.
             planner: A planner; see :func:`apex_ompl.plan`.
             name: Name of the problem in the result.
             search: How goals are chosen.

@@ -140,6 +140,8 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
         return Goal(alignment=target)
     if isinstance(target, PoseTarget):
         return Goal(poses=(target,))
+    if isinstance(target, GoalSampler):
+        raise ParameterError("goal", target, "no object that draws states, which is a goal of plans alone")
     if isinstance(target, Sequence) and target and all(isinstance(one, PoseTarget) for one in target):
         return validate(Goal, {"poses": tuple(target)}, "goal")
     several = list[dict[str, float]]()
@@ -181,6 +183,8 @@ def sampled_goals(
 def _several(target: Any) -> Sequence[Any]:
     if isinstance(target, str | Mapping):
         return [target]
+    if isinstance(target, Sequence) and any(isinstance(one, PoseTarget | Alignment | Goal | AnyOf) for one in target):
+        raise ParameterError("goal", target, "states alone, poses alone, or AnyOf of both")
     if isinstance(target, Sequence) and target and any(isinstance(one, str | Mapping) for one in target):
         return target
     values = finite_array(target, "goal")
@@ -218,6 +222,16 @@ def dynamic_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
             "snapshot", False, f"True, since the obstacle {scripted!r} follows a script, which `apex-ompl run` runs"
         )
     return dynamic
+
+
+def check_problem(problem: Problem) -> None:
+    """Check that a problem is one.
+
+    Raises:
+        ParameterError: It is something else, such as its name.
+    """
+    if not isinstance(problem, Problem):
+        raise ParameterError("problem", problem, "a Problem, as load_problem returns")
 
 
 def check_is_no_line(problem: Problem) -> None:

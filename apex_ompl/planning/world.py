@@ -14,6 +14,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry, with_file_read, with_file_unread
 from apex_ompl.errors import FileFormatError, SceneError
 from apex_ompl.planning.cloud_files import CloudFiles, cloud_of
+from apex_ompl.planning.query import State, check_problem, state_array
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import Problem
@@ -21,7 +22,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import validate
-from apex_ompl.util.validation import finite_array
+from apex_ompl.util.validation import check_flag
 
 if TYPE_CHECKING:
     from apex_ompl.scene.bodies import (
@@ -226,7 +227,7 @@ class World:
 
     def attach(
         self, held: AttachedObject | Mapping[str, Any] | str, link: str | None = None,
-        touch_links: Sequence[str] | None = None, *, links: Sequence[str] | None = None, at: ArrayLike | None = None,
+        touch_links: Sequence[str] | None = None, *, links: Sequence[str] | None = None, at: State | None = None,
     ) -> None:  # fmt: skip
         """Attach an object to a link; it then collides like a part of the robot.
 
@@ -237,27 +238,28 @@ class World:
             touch_links: Links that it may touch; by default those of the hand.
             links: Two links that hold it together, in place of ``link``: the second keeps its pose in the first along
                 every path.
-            at: State at which it is taken, shape (dof,); must be given for an obstacle. The object must not overlap
-                anything there.
+            at: State at which it is taken; must be given for an obstacle. The object must not overlap anything there.
 
         Raises:
             SceneError: The name is taken, there is no such obstacle, or the object overlaps something.
             UnknownNameError: An unknown link.
             FileFormatError: A field is unknown or faulty.
+            ParameterError: ``at`` has not the robot's joints.
         """
+        q = None if at is None else state_array(self.checker.robot, at, "at")
         with self.lock:
             taken = None
             if links is not None:
-                if link is not None:
-                    raise SceneError("give either one link or links, not both")
+                if link is not None or isinstance(links, str):
+                    raise SceneError("give either one link or links, a list of two, not both")
                 link = next(iter(links), None)
             if isinstance(held, str):
-                if link is None or at is None:
+                if link is None or q is None:
                     raise SceneError(
                         f"to attach the obstacle {held!r}, give the link and the state at which it is taken"
                     )
                 taken = self.checker.obstacle(held)
-                held = self._as_held(taken, link, finite_array(at, "at"))
+                held = self._as_held(taken, link, q)
             wanted = self._read(AttachedObject, held, "held object")
             wanted = with_file_unread(wanted) if taken is None else wanted
             changes = {"link": link, "links": links, "touch_links": touch_links}
@@ -269,8 +271,8 @@ class World:
                 self.checker.remove(taken.name)
             try:
                 self.checker.attach(wanted)
-                if at is not None:
-                    self._check_grasp(wanted.name, finite_array(at, "at"))
+                if q is not None:
+                    self._check_grasp(wanted.name, q)
             except Exception:
                 if wanted.name in self.held and (taken is not None or self.held[wanted.name] is wanted):
                     self.checker.detach(wanted.name)
@@ -280,16 +282,18 @@ class World:
                     self.checker.allow(*pair)
                 raise
 
-    def detach(self, name: str, *, at: ArrayLike | None = None) -> None:
-        """Remove a held object; with a state ``at``, shape (dof,), it stays in the world where it is then.
+    def detach(self, name: str, *, at: State | None = None) -> None:
+        """Remove a held object; with a state ``at`` it stays in the world where it is then.
 
         Raises:
             SceneError: There is no such held object.
+            ParameterError: The state has not the robot's joints.
         """
+        q = None if at is None else state_array(self.checker.robot, at, "at")
         with self.lock:
             held, left = self.held.get(name) if isinstance(name, str) else None, list[Obstacle]()
-            if at is not None and held is not None:
-                pose = self.checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
+            if q is not None and held is not None:
+                pose = self.checker.robot.link_pose(q, held.link) @ held.pose
                 shape = given_fields(held, ("link", "links", "touch_links"))
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
             self.checker.detach(name)
@@ -312,8 +316,10 @@ class World:
 
         Raises:
             UnknownNameError: There is no such body.
+            ParameterError: ``allowed`` is no truth value.
             SceneError: Both names are of the same body.
         """
+        check_flag(allowed, "allowed")
         with self.lock:
             self.checker.allow(first, second, allowed)
 
@@ -331,8 +337,10 @@ class World:
         """Replace all obstacles, held objects and allowed pairs by those of a problem.
 
         Raises:
+            ParameterError: It is no problem.
             ApexError: A body of the problem is faulty; the world is then empty.
         """
+        check_problem(problem)
         with self.lock:
             self.clear()
             try:

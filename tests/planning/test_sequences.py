@@ -125,6 +125,22 @@ def shelved(planner: MotionPlanner) -> list[dict[str, Any]]:
     ]
 
 
+@pytest.mark.parametrize("last", [{"kind": "move", "goal": "home"}, {"kind": "line", "frame": "hand", "by": (0, 0, 5)}])
+def test_the_world_is_the_same_after_a_sequence(last: dict[str, Any]) -> None:
+    """Bodies in their order, allowed pairs and held objects, whether it was planned or a step failed after a grasp."""
+    with MotionPlanner("panda") as planner:
+        world, steps = planner.world, shelved(planner)
+        world.add(name="post", box=(0.05, 0.05, 0.2), position=(0.2, 0.6, 0.3))
+        world.attach({"name": "label", "link": "panda_link5", "box": (0.01, 0.01, 0.01), "position": (0.0, 0.0, 0.3)})
+        world.allow("post", "panda_link7")
+        before = [*world.obstacles.items()], [*world.held.items()], world.allowed
+        found = planner.sequence(
+            "home", [*steps[:5], {"kind": "allow", "pairs": [["box", "roof"]]}, last], timeout=20.0
+        )
+        assert bool(found) == (last["kind"] == "move")
+        assert ([*world.obstacles.items()], [*world.held.items()], world.allowed) == before
+
+
 def test_the_grasp_is_one_that_suits_the_place() -> None:
     with MotionPlanner("panda") as planner:
         steps = shelved(planner)

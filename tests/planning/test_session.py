@@ -22,6 +22,7 @@ from apex_ompl.collision.conservative import ConservativeChecker
 from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.ompl.validity import full_check
+from apex_ompl.planning import TaskSearch
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
@@ -454,6 +455,11 @@ def test_both_arms_are_a_group_without_the_hands(planner: MotionPlanner, robot: 
         planner.plan(robot.home, goal, group=[])
 
 
+class Drawn:
+    def sample(self, rng: np.random.Generator) -> None:
+        return None
+
+
 def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> None:
     home, hard = robot.home, load_problem("shelf/hard/800000")
     named = dict(zip(robot.joint_names, home.tolist(), strict=True))
@@ -478,6 +484,19 @@ def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> Non
         ),
         (UnknownNameError, "unknown option 'started'; known", lambda: planner.plan_problem(hard, started=3.0)),
         (UnknownNameError, "unknown group or joint 5", lambda: planner.plan(home, home, group=[5])),
+        (ParameterError, "constraints: expected a list", lambda: planner.plan(home, home, constraints=None)),
+        (ParameterError, "constraints: expected a list", lambda: planner.prove([home], constraints="upright")),
+        (ParameterError, "goal: expected states alone, poses alone", lambda: planner.plan(home, ["home", hand])),
+        (ParameterError, "goal: expected finite numbers, got None", lambda: planner.plan(home, None)),
+        (ParameterError, "problem: expected a Problem", lambda: planner.plan_problem("ball_in_cup")),
+        (ParameterError, "problem: expected a Problem", lambda: planner.plan_task("ball_in_cup")),
+        (ParameterError, "search: expected a TaskSearch", lambda: planner.plan_task(hard, search=3)),
+        (ParameterError, "wanted: expected a whole number, 1", lambda: TaskSearch(wanted=0)),
+        (
+            ParameterError,
+            "goal: expected no object that draws states",
+            lambda: planner.sequence(home, [{"kind": "move", "goal": Drawn()}]),
+        ),
     )
     for error, said, call in faulty:
         with pytest.raises(error, match=said):
