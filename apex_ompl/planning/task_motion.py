@@ -17,16 +17,7 @@ from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import (
-    AttachStep,
-    DetachStep,
-    GraspStep,
-    MotionStep,
-    ReleaseStep,
-    RetreatStep,
-    Step,
-    TogetherStep,
-)
+from apex_ompl.scene.steps import DetachStep, MotionStep, ReleaseStep, RetreatStep, Step, TakingStep, TogetherStep
 from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.trajectory import ROUNDING, joined
@@ -199,7 +190,7 @@ def changes(step: Step, world: TaskWorld) -> tuple[tuple[str, ...], tuple[str, .
             released += one.objects or world.held_by(one.hand)
         elif isinstance(one, DetachStep):
             released.append(one.object)
-        elif isinstance(one, GraspStep | AttachStep):
+        elif isinstance(one, TakingStep):
             grasped.append(one.object)
     return tuple(released), tuple(grasped)
 

@@ -23,7 +23,7 @@ from apex_ompl.planning.task_steps import StepPlanner
 from apex_ompl.planning.task_waypoints import StepFailed
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TogetherStep, TurnStep
+from apex_ompl.scene.steps import GraspStep, HandedStep, StraightStep, TogetherStep
 from apex_ompl.types import Array
 
 BREADTH = 4  # goals of a later stage that are tried from one state
@@ -120,10 +120,10 @@ class Rehearsal:
         return world, q
 
     def _step(self, step: AnyStep, world: TaskWorld, q: Array) -> tuple[TaskWorld, Array]:
-        if isinstance(step, LineStep | TurnStep | RetreatStep):
+        if isinstance(step, StraightStep):
             end = self._tracked(step, world, q)
             return world.after(step, end), end
-        if isinstance(step, HandStep | ReleaseStep | GraspStep):
+        if isinstance(step, HandedStep):
             during = world.grasped(step, q) if isinstance(step, GraspStep) else world
             end = self.planner.hand_end(during, step, q)
             self.planner.become(during)
@@ -136,7 +136,7 @@ class Rehearsal:
             return world.after(step, end), end
         return world.after(step, q), q
 
-    def _tracked(self, step: LineStep | TurnStep | RetreatStep, world: TaskWorld, q: Array) -> Array:
+    def _tracked(self, step: StraightStep, world: TaskWorld, q: Array) -> Array:
         """Return the last state of straight lines, shape (dof,)."""
         query = self.planner.line_query(world, step, q, None)
         if are_same(query.poses):

@@ -25,14 +25,14 @@ from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
 from apex_ompl.scene.steps import (
-    AllowStep,
-    AttachStep,
+    BodiesStep,
     DetachStep,
     GraspStep,
-    HandStep,
+    HandedStep,
     LineStep,
-    ReleaseStep,
     RetreatStep,
+    StraightStep,
+    TakingStep,
     TogetherStep,
     TurnStep,
     WaitStep,
@@ -158,7 +158,7 @@ class StepPlanner:
             return self._line(world, step, q, timing)
         if isinstance(step, TogetherStep):
             return self._together(world, step, q, timing)
-        if isinstance(step, AttachStep | DetachStep | AllowStep):
+        if isinstance(step, BodiesStep):
             during = world if isinstance(step, DetachStep) else world.after(step, q)
             return self._proved(StepPlan(step, during, world.after(step, q), Path(q[None]), None, nan), timing)
         assert not isinstance(step, MoveStep)
@@ -168,9 +168,7 @@ class StepPlanner:
         """Put the bodies of a world into the checker, with other pairs that may touch if they are given."""
         self.checker.become(world.scene, world.held, world.pairs if pairs is None else pairs)
 
-    def line_query(
-        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
-    ) -> LineQuery:
+    def line_query(self, world: TaskWorld, step: StraightStep, q: Array, timing: Timing | None) -> LineQuery:
         """Return what a step along straight lines is about; the checker has the bodies of its world then.
 
         Raises:
@@ -183,9 +181,7 @@ class StepPlanner:
             timing=False if timing is None else timing_in(world, timing), problem=lambda goals: self.problem,
         )  # fmt: skip
 
-    def _line(
-        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
-    ) -> StepPlan:
+    def _line(self, world: TaskWorld, step: StraightStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return straight lines from poses of frames to poses, with blends between them."""
         query = self.line_query(world, step, q, timing)
         found = plan_along(self.checker, query, self._deadline, self._ends)
@@ -203,16 +199,14 @@ class StepPlanner:
             deviation=0.0 if found.trajectory is None else found.deviation,
         )  # fmt: skip
 
-    def _hand(
-        self, world: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array, timing: Timing | None
-    ) -> StepPlan:
+    def _hand(self, world: TaskWorld, step: HandedStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a hand that opens or closes."""
         during = world.grasped(step, q) if isinstance(step, GraspStep) else world
         end = self.hand_end(during, step, q)
         states = np.stack([q, end]) if (end != q).any() else q[None]
         return self._proved(StepPlan(step, during, world.after(step, end), Path(states), None, nan), timing)
 
-    def hand_end(self, during: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array) -> Array:
+    def hand_end(self, during: TaskWorld, step: HandedStep, q: Array) -> Array:
         """Return the state after a hand has opened or closed, shape (dof,).
 
         Raises:
@@ -250,7 +244,7 @@ class StepPlanner:
             raise StepFailed(f"two of them move {self.robot.joint_names[shared[0]]}")
         during, after, end = world, world, q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
         for one in step.steps:
-            during = during.after(one, q) if isinstance(one, GraspStep | AttachStep) else during
+            during = during.after(one, q) if isinstance(one, TakingStep) else during
             after = after.after(one, end)
         motions = [plan.motion for plan in plans if plan.motion is not None]
         motion = superposed([(one, 0.0) for one in motions]) if len(motions) == len(plans) else None

@@ -311,6 +311,14 @@ class AllowStep(Step):
         return pairs if self.contact else f"{pairs} no longer"
 
 
+StraightStep = LineStep | TurnStep | RetreatStep
+"""A step along which frames go straight, or turn."""
+HandedStep = HandStep | ReleaseStep | GraspStep
+"""A step in which a hand opens or closes."""
+TakingStep = GraspStep | AttachStep
+"""A step after which an object is held."""
+BodiesStep = AttachStep | DetachStep | AllowStep
+"""A step in which bodies change and nothing moves."""
 SimultaneousStep = (
     LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep | AttachStep | DetachStep
 )
