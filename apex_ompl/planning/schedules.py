@@ -298,38 +298,55 @@ class _Search:
         return node.end, node.end, frozenset({step.group})
 
     def _planned(self, node: _Node, step: ArmStep) -> _Node | str:
-        """Return what is planned with one more step, or why that cannot be."""
-        begin, clock, moved = self._start(node, step)
-        group, names = step.group, self._joints[step.group]
-        robot, own = self._planner.robot, node.motions[step.group]
-        others = [motion for other, motion in node.motions.items() if other != group]
-        now = dict(zip(robot.joint_names, self.start.tolist(), strict=True))
-        for motion in (own, *others):
-            now |= dict(zip(motion.joint_names, motion(begin).tolist(), strict=True))
-        beside = together(others) if others and max(m.duration for m in others) > begin else None
-        left = max(self._how.until - time.perf_counter(), 0.1) if self.orders else PLAN_SECONDS
-        given: dict[str, Any] = {} if beside is None else {"while_executing": beside, "offset": begin}
-        options = {"timeout": min(PLAN_SECONDS, left), "seed": self._how.seed, **self._how.options, **given}
-        self.plans += 1
-        result = self._planner.plan(now, step.goal, group=group, **options)
+        """Return what is planned with one more step, or why that cannot be.
+
+        Where no motion beside those of the others is found, the arm waits until they rest.
+        """
+        start, clock, moved = self._start(node, step)
+        names, own = self._joints[step.group], node.motions[step.group]
+        begin, rested = start, max(motion.duration for motion in node.motions.values())
+        result = self._plan(node, step, begin)
+        if not result and result.status is not PlanStatus.INVALID_GOAL and begin < rested and self._waits(node, begin):
+            begin, result = rested, self._plan(node, step, rested)
         if not result or result.trajectory is None:
             return f"{step.name}: {result.reason}"
         motion = until_rest(result.trajectory.selected(names))
         parts = [own, rest(own.positions[-1], begin - own.duration, names), motion]
         whole = joined([*parts, rest(motion.positions[-1], step.hold, names)])
-        done = ScheduledStep(step.name, group, begin, whole.duration, tuple(step.after))
+        done = ScheduledStep(step.name, step.group, start, whole.duration, tuple(step.after))
         for waiting in node.done:
             if step.name in waiting.after and waiting.start < done.end:
                 return f"{step.name}: it ends at {done.end:.3f} s, and {waiting.name} starts at {waiting.start:.3f} s"
-        return _Node({**node.motions, group: whole}, (*node.done, done), clock, moved)
+        return _Node({**node.motions, step.group: whole}, (*node.done, done), clock, moved)
+
+    def _plan(self, node: _Node, step: ArmStep, begin: float) -> PlanResult:
+        """Return the plan of a step from a time on [s], beside what the other arms do then."""
+        others = [motion for group, motion in node.motions.items() if group != step.group]
+        moving = any(motion.duration > begin for motion in others)
+        left = max(self._how.until - time.perf_counter(), 0.1) if self.orders else PLAN_SECONDS
+        given: dict[str, Any] = {"while_executing": together(others), "offset": begin} if moving else {}
+        options = {"timeout": min(PLAN_SECONDS, left), "seed": self._how.seed, **self._how.options, **given}
+        self.plans += 1
+        state = dict(zip(self._planner.robot.joint_names, self._motion(node)(begin).tolist(), strict=True))
+        return self._planner.plan(state, step.goal, group=step.group, **options)
+
+    def _waits(self, node: _Node, begin: float) -> bool:
+        """Whether an arm that rests from a time on [s] is proved free until the others rest."""
+        if self._how.options.get("constraints"):
+            return False
+        return bool(full_check(self._planner.checker, self._motion(node).after(begin)))
+
+    def _motion(self, node: _Node) -> Trajectory:
+        """Return the motion of all joints."""
+        still = rest(self.start, 0.0, self._planner.robot.joint_names)
+        return GivenMotion.of(self._planner.robot, together([*node.motions.values()])).combined(still)
 
     def _schedule(self, node: _Node | None, status: PlanStatus, reason: str) -> Schedule:
         """Return the schedule of a complete order, proved as one motion of all joints, or why there is none."""
         reached = node if node is not None else self._nodes[()]
         assert isinstance(reached, _Node)
         planner, robot = self._planner, self._planner.robot
-        still = rest(self.start, 0.0, robot.joint_names)
-        motion = GivenMotion.of(robot, together([*reached.motions.values()])).combined(still)
+        motion = self._motion(reached)
         problem = planner.problem(motion.positions[0], motion.positions[-1], "schedule")
         result = PlanResult(
             status=status, reason=reason, problem=problem, robot=robot.name, joint_names=robot.joint_names,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from apex_ompl.moving.given_motion import GivenMotion
 from apex_ompl.moving.motion_optimizer import MotionOptimizer
 from apex_ompl.planning import ArmStep, replaced, schedule
 from apex_ompl.planning.while_executing import Asked, WhileExecuting, moved_links
-from apex_ompl.result import PlanStatus
+from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
 from apex_ompl.timing import Timing
 from apex_ompl.timing.combination import rest, superposed, together, until_rest
@@ -361,3 +362,29 @@ def test_motions_beside_another_keep_the_limits_of_torques_and_tools(
             rest(robot.home, states.duration, robot.joint_names)
         )
         assert limits is not None and max(limits.use(alone).values()) <= 1.0
+
+
+def test_an_arm_waits_where_no_motion_beside_the_others_is_found(
+    planner: MotionPlanner, reached: dict[str, dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that what arms can do one after the other is a schedule in every mode."""
+    robot, known = planner.robot, MotionPlanner.plan
+
+    def plan(self: MotionPlanner, *given: object, **options: object) -> PlanResult:
+        result = known(self, *given, **options)  # type: ignore[arg-type]
+        fails = options.get("while_executing") is not None and result.status is PlanStatus.EXACT_SOLUTION
+        return replace(result, status=PlanStatus.TIMEOUT) if fails else result
+
+    monkeypatch.setattr(MotionPlanner, "plan", plan)
+    steps = [
+        step_of("put", "left", reached["left"]),
+        step_of("away", "left", turned(robot, "left", 0.4)),
+        step_of("take", "right", reached["right"], after="put"),
+    ]
+    found = schedule(planner, "home", steps, most_plans=6)
+    assert found and found.trajectory is not None, found.reason
+    assert collisions(robot, found.trajectory) == 0
+    times = {step.name: step for step in found.steps}
+    assert times["take"].start == times["put"].end  # from then on it waits until the left arm is away
+    waits = GivenMotion.of(robot, found.motions["right_arm"])
+    assert waits.at(times["away"].end) == pytest.approx(waits.at(0.0), abs=1e-12)
