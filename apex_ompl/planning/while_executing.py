@@ -389,7 +389,7 @@ def moved_links(robot: Robot, columns: tuple[int, ...]) -> frozenset[str]:
     for q in states:
         pin.framesForwardKinematics(robot.model, data, robot.to_pinocchio(q))
         places.append(np.array([data.oMf[k].homogeneous for k in numbers.values()]))
-    moves = np.abs(np.array(places[:-1]) - places[-1]).max(axis=(0, 2, 3), initial=0.0) > SAME_PLACE
+    moves = np.abs(np.array(places) - places[-1]).max(axis=(0, 2, 3), initial=0.0) > SAME_PLACE
     return frozenset(link for link, one in zip(numbers, moves.tolist(), strict=True) if one)
 
 

@@ -388,3 +388,12 @@ def test_an_arm_waits_where_no_motion_beside_the_others_is_found(
     assert times["take"].start == times["put"].end  # from then on it waits until the left arm is away
     waits = GivenMotion.of(robot, found.motions["right_arm"])
     assert waits.at(times["away"].end) == pytest.approx(waits.at(0.0), abs=1e-12)
+
+
+def test_a_given_motion_may_be_a_rest(planner: MotionPlanner, reached: dict[str, dict[str, float]]) -> None:
+    robot = planner.robot
+    for names in (robot.joint_names, robot.joint_names[7:14]):
+        still = rest(robot.home[[robot.joint_names.index(name) for name in names]], 1.0, names)
+        found = planner.plan("home", reached["left"], group="left_arm", while_executing=still)
+        assert found and found.trajectory is not None and found.trajectory.duration >= 1.0
+        assert not np.ptp(found.trajectory.positions[:, 7:14], axis=0).any()
