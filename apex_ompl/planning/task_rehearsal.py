@@ -18,6 +18,7 @@ from apex_ompl.constraints.line_tracking import LineTracker, Track
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.ompl.setup import state_fault
+from apex_ompl.planning.query import Group
 from apex_ompl.planning.task_goals import TaskGoal, task_goal
 from apex_ompl.planning.task_steps import StepPlanner
 from apex_ompl.planning.task_waypoints import StepFailed
@@ -57,15 +58,17 @@ def stages(problem: Problem) -> list[Stage]:
 class Rehearsal:
     """Goes through the steps of one task without planning motions."""
 
-    def __init__(self, planner: StepPlanner, seed: int, stop: Callable[[], bool]) -> None:
+    def __init__(self, planner: StepPlanner, seed: int, stop: Callable[[], bool], group: Group | None = None) -> None:
         """Rehearse the task of a planner of steps.
 
         Args:
             planner: The planner; its checker is used.
             seed: Seed of the descents.
             stop: Whether no time is left.
+            group: Joints that are planned where a motion names none.
         """
         self.planner, self.stages, self.seed, self.stop = planner, stages(planner.problem), seed, stop
+        self._group = group
         self._visits, self._thorough = 0, False
 
     def later_goals(self, k: int, world: TaskWorld, q: Array, thorough: bool = False) -> list[Array]:
@@ -102,7 +105,8 @@ class Rehearsal:
 
     def _goals(self, k: int, world: TaskWorld, q: Array) -> Array:
         """Return a few free states that reach the goal of a stage from a state, shape (N, dof)."""
-        made = task_goal(self.planner.robot, world, self.planner.problem, self.stages[k].move, q)
+        move = self.stages[k].move
+        made = task_goal(self.planner.robot, world, self.planner.problem, move, q, group=self._group)
         self.planner.become(world)
         return reached(self.planner, made, np.random.default_rng([self.seed, k]))
 

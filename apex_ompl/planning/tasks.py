@@ -148,7 +148,7 @@ class TaskPlanner:
         bodies = self.world.scene.values(), self.world.held.values(), self.world.allowed
         mine = CollisionChecker(checker.robot, *bodies)
         self._steps = StepPlanner(mine, problem, self._deadline, lambda: self._interrupt.pressed)
-        self._rehearsal = Rehearsal(self._steps, options.seed, self._ends)
+        self._rehearsal = Rehearsal(self._steps, options.seed, self._ends, options.group)
         self._stages = self._rehearsal.stages
         self._first: PlanResult | None = None
 

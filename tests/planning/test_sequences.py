@@ -15,18 +15,23 @@ import pytest
 from planning import cached_problem
 from tasks import contacts, poses
 
-from apex_ompl import ApexError, MotionPlanner, PlanStatus, PoseTarget, TaskResult, load_robot, plan_task
+from apex_ompl import AnyOf, ApexError, MotionPlanner, PlanStatus, PoseTarget, TaskResult, load_robot, plan_task
 from apex_ompl.cli.parser import main
 from apex_ompl.goals.grasp_goal import MOST, pose_alternatives
 from apex_ompl.paths.path import abreast
 from apex_ompl.planning import TaskSearch
+from apex_ompl.planning.task_problem import sequence_problem
+from apex_ompl.planning.task_rehearsal import Rehearsal
 from apex_ompl.planning.task_result import load_result
+from apex_ompl.planning.task_steps import StepPlanner
+from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.problems import cells
 from apex_ompl.scene import Goal, Problem
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.rests import is_at_rest
 from apex_ompl.types import Array
+from apex_ompl.util.clocks import Deadline
 
 SECONDS = 60.0
 READY = ("pick_and_place", "pick_and_hand_over", "stack_three_boxes")
@@ -155,6 +160,22 @@ def test_the_grasp_is_one_that_suits_the_place() -> None:
         assert hand[0, 2] > 0.999  # from the side
         assert "box" in planner.world.obstacles and not planner.world.held  # the world is as before
         assert {step.kind for step in result.steps} == {"goal", "line", "grasp", "move", "release", "retreat"}
+
+
+def test_later_goals_are_rehearsed_with_the_joints_that_are_planned() -> None:
+    """Of two poses only the one of the arm that is planned; the other hand is there already, so that it is nearest."""
+    with MotionPlanner() as planner:
+        robot, at = planner.robot, {side: planner.fk("home", f"{side}_hand")[:3, 3] for side in ("left", "right")}
+        there = PoseTarget(frame="right_hand", position=tuple(at["right"] + (0.0, 0.0, 0.02)))
+        here = PoseTarget(frame="left_hand", position=tuple(at["left"] + (0.0, 0.0, 0.1)))
+        steps = [entry("wait", seconds=0.1), entry("move", goal=AnyOf([there, here])), entry("wait", seconds=0.1)]
+        problem = sequence_problem(robot, planner.problem("home", "home"), steps)
+        mine = StepPlanner(planner.checker, problem, Deadline(10.0), lambda: False)
+        world = TaskWorld.of(robot, problem)
+        for group, side in (("left_arm", "left"), ("right_arm", "right")):
+            (goal,) = Rehearsal(mine, 0, lambda: False, group).later_goals(0, world, robot.home)
+            moved = [name for name, q, home in zip(robot.joint_names, goal, robot.home, strict=True) if q != home]
+            assert moved and all(name.startswith(f"{side}_joint") for name in moved)
 
 
 def test_what_cannot_be_done_is_counted_by_cause() -> None:
