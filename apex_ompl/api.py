@@ -15,7 +15,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.planners import AnyPlanner
 from apex_ompl.planning.options import PlanKeywords, PlanOptions, check_arguments
-from apex_ompl.planning.planner import kept_planner
+from apex_ompl.planning.pool import kept_planner
 from apex_ompl.result import PlanResult
 from apex_ompl.robot.model import named_poses
 from apex_ompl.scene.problem import Problem

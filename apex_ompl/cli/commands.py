@@ -51,10 +51,15 @@ def check(parsed: argparse.Namespace) -> int:
     """Validate a problem, and print whether start and goal are free."""
     from apex_ompl.api import load_problem
     from apex_ompl.ompl.setup import assemble
+    from apex_ompl.planning.task_problem import with_lines
     from apex_ompl.planning.task_world import check_steps
+    from apex_ompl.timing import Timing
 
     setup = assemble(load_problem(parsed.problem))
     problem = setup.problem
+    check_steps(setup.robot, problem)
+    with_lines(problem)  # of goals with approaches
+    Timing().motion_limits(setup.robot, problem.attached, problem.payload)
     print(f"{problem.name}: robot {setup.robot.name}, {setup.robot.dof} joints")
     moving = f", moving: {', '.join(problem.moving)}" if problem.moving else ""
     print(f"  scene      {len(problem.scene)} obstacles{moving}")
@@ -69,7 +74,6 @@ def check(parsed: argparse.Namespace) -> int:
     for k, fault in enumerate(goal_faults):
         label = "goal" if len(goal_faults) == 1 else f"goal {k}"
         print(f"  {label:<10} {fault or 'free'}{note}")
-    check_steps(setup.robot, problem)
     for step in problem.after:
         print(f"  after      {step.title}")
     for text in setup.notes:

@@ -7,13 +7,12 @@ import json
 import math
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
 
 from apex_ompl.cli.options import name_value_pairs
+from apex_ompl.cli.progress import progress_bars
 from apex_ompl.collision.cover.pairs import PairSearch
-from apex_ompl.collision.cover.preparation import Preparation, Report
+from apex_ompl.collision.cover.preparation import Preparation
 from apex_ompl.collision.cover.preparation import prepare as prepare_robot
 from apex_ompl.collision.cover.survey import Survey, survey
 from apex_ompl.errors import ParameterError
@@ -122,7 +121,7 @@ def prepare(parsed: argparse.Namespace) -> int:
         budget=parsed.budget, jobs=parsed.jobs, effort=parsed.effort,
         pairs=PairSearch(parsed.samples, parsed.margin, parsed.seed, tuple(parsed.soft)),
     )  # fmt: skip
-    with _bars() as report:
+    with progress_bars() as report:
         done = prepare_robot(parsed.robot, settings, report)
     covers = ", ".join(f"{number} with effort {effort}" for effort, number in done.covers.items()) or "none"
     rows = [
@@ -135,23 +134,3 @@ def prepare(parsed: argparse.Namespace) -> int:
         rows.append(("next", "the time was not enough for all of it; the same command goes on"))
     print(Summary(str(parsed.robot), [*rows, *(("file", str(file)) for file in done.files)]))
     return 0
-
-
-@contextmanager
-def _bars() -> Iterator[Report]:
-    """Show the progress of each stage on a terminal."""
-    from tqdm import tqdm
-
-    bars: dict[str, tqdm[NoReturn]] = {}
-    shown = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}"
-
-    def report(stage: str, share: float) -> None:
-        if stage not in bars:
-            bars[stage] = tqdm(total=1.0, desc=stage, disable=None, bar_format=shown)
-        bars[stage].update(share - bars[stage].n)
-
-    try:
-        yield report
-    finally:
-        for bar in bars.values():
-            bar.close()

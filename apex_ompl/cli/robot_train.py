@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import NoReturn
 
-from apex_ompl.onboarding.session import Report, Session, Trained, train_robot
+from apex_ompl.cli.progress import progress_bars
+from apex_ompl.onboarding.session import Session, Trained, train_robot
 from apex_ompl.util.display import Summary, counted
 
 
 def train(parsed: argparse.Namespace) -> int:
     """Train a model for a robot, and print what its proposals gain."""
     settings = Session(parsed.hours, parsed.jobs, parsed.seed)
-    with _bars() as report:
+    with progress_bars() as report:
         done = train_robot(parsed.robot, parsed.out, settings, report)
     print(_summary(parsed.robot, done))
     return 0
@@ -31,24 +29,3 @@ def _summary(name: str, done: Trained) -> Summary:
         ("gain", told["verdict"]),
         ("file", str(done.model)),
     ])  # fmt: skip
-
-
-@contextmanager
-def _bars() -> Iterator[Report]:
-    """Show the progress of each stage on a terminal."""
-    from tqdm import tqdm
-
-    bars: dict[str, tqdm[NoReturn]] = {}
-    shown = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}{postfix}"
-
-    def report(stage: str, share: float, text: str) -> None:
-        if stage not in bars:
-            bars[stage] = tqdm(total=1.0, desc=stage, disable=None, bar_format=shown)
-        bars[stage].set_postfix_str(text, refresh=False)
-        bars[stage].update(share - bars[stage].n)
-
-    try:
-        yield report
-    finally:
-        for bar in bars.values():
-            bar.close()

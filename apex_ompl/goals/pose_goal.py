@@ -186,7 +186,7 @@ def _drawn(pose: PoseTarget, placed: Array, rng: np.random.Generator | None, tur
     }  # fmt: skip
     if turns and pose.turn is not None and pose.free_turn is not None:
         k = "xyz".index(pose.free_turn)
-        by = float(np.clip(_twist(product(wanted[:3, :3].T, placed[:3, :3]), k), *pose.turn))
+        by = _nearest_turn(_twist(product(wanted[:3, :3].T, placed[:3, :3]), k), pose.turn)[0]
         by = by if rng is None else float(rng.uniform(*pose.turn))
         turned = product(wanted[:3, :3], pin.exp3(by * np.eye(3)[k]))
         update |= {"orientation": tuple(pin.Quaternion(turned).coeffs().tolist()), "free_turn": None, "turn": None}
@@ -221,8 +221,7 @@ def _turned(pose: PoseTarget, frame: Frame, found: Array, wanted: Array) -> floa
         off = angle(found[:, k], wanted[:, k])
         if pose.turn is None or frame.axial:
             return off
-        by = _twist(wanted.T @ found, k)
-        return max(off, abs(by - float(np.clip(by, *pose.turn))))
+        return max(off, _nearest_turn(_twist(wanted.T @ found, k), pose.turn)[1])
     return rotation_angle(found, wanted)
 
 
@@ -231,6 +230,14 @@ def _twist(rotation: Array, k: int) -> float:
     xyzw = pin.Quaternion(rotation).coeffs()
     by = 2.0 * float(np.arctan2(xyzw[k], xyzw[3]))
     return by - 2.0 * np.pi * round(by / (2.0 * np.pi))
+
+
+def _nearest_turn(by: float, turn: tuple[float, float]) -> tuple[float, float]:
+    """Return the angle in a range that is nearest to another one but for whole turns, and how far it is [rad]."""
+    middle = (turn[0] + turn[1]) / 2.0
+    by = middle + float(np.remainder(by - middle + np.pi, 2.0 * np.pi)) - np.pi
+    nearest = min(max(by, turn[0]), turn[1])
+    return nearest, abs(by - nearest)
 
 
 def rotation_angle(first: Array, second: Array) -> float:

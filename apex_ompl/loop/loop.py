@@ -30,7 +30,7 @@ from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
 from apex_ompl.moving.replanner import Replanner
 from apex_ompl.moving.settings import FOLLOWED, LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
-from apex_ompl.planning.world import CloudFiles
+from apex_ompl.planning.cloud_files import CloudFiles
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Trajectory

@@ -57,9 +57,12 @@ class DynamicObstacles:
 
         Raises:
             SceneError: A name is given twice.
-            ParameterError: An obstacle is a half-space.
+            ParameterError: An obstacle is a half-space, or none at all.
         """
-        given = tuple(obstacles)
+        given = tuple(obstacles) if isinstance(obstacles, Iterable) else (obstacles,)
+        for o in given:
+            if not isinstance(o, Obstacle):
+                raise ParameterError("obstacles", obstacles, "a list of obstacles")
         self.names = tuple(o.name for o in given)
         if len(set(self.names)) < len(given):
             raise SceneError(f"names of dynamic obstacles must differ, found {', '.join(o.name for o in given)}")

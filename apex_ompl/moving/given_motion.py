@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.timing import Trajectory
+from apex_ompl.timing.knots import union
 from apex_ompl.types import Array
 from apex_ompl.util.display import one_line
 from apex_ompl.util.validation import check_name, check_number
-
-NEAREST = 1e-9  # knots that are nearer to each other than this are one [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +106,7 @@ class GivenMotion:
         Args:
             own: Motion of all joints; values of the given ones are replaced.
         """
-        times = _union(own.times, self.motion.times)
+        times = union(own.times, self.motion.times)
         states = own.states(times)
         for k in (0, -1):  # exact where it ends
             if times[k] == own.times[k]:
@@ -131,42 +130,3 @@ def _later(motion: Trajectory, by: float) -> Trajectory:
         raise ParameterError("offset", -by, "0 or more, since the motion is not at rest at its start")
     q, v, a = (np.concatenate([rows[:1], rows]) for rows in (motion.positions, motion.velocities, motion.accelerations))
     return Trajectory(np.append(0.0, motion.times + by), q, v, a, motion.joint_names)
-
-
-def together(motions: Sequence[Trajectory]) -> Trajectory:
-    """Return motions of different joints, which start at the same time, as one; each stands still after its end.
-
-    Raises:
-        ParameterError: No motion, or a joint in two of them.
-    """
-    names = [name for motion in motions for name in motion.joint_names]
-    if not names or len(set(names)) < len(names):
-        raise ParameterError("motions", ", ".join(names) or "none", "motions of different joints")
-    times = _union(*(motion.times for motion in motions))
-    states = np.concatenate([motion.states(times) for motion in motions], axis=2)
-    return Trajectory(times, states[0], states[1], states[2], tuple(names))
-
-
-def rest(state: Array, duration: float, joint_names: Sequence[str]) -> Trajectory:
-    """Return the motion that stands at a state, shape (dof,), for a time [s]."""
-    times = np.array([0.0, duration]) if duration > 0.0 else np.zeros(1)
-    still = np.zeros((len(times), len(state)))
-    return Trajectory(times, still + state, still, still, tuple(joint_names))
-
-
-def until_rest(motion: Trajectory) -> Trajectory:
-    """Return a motion without the rest at its end."""
-    moving = (motion.positions != motion.positions[-1]).any(axis=1)
-    moving |= (motion.velocities != 0.0).any(axis=1) | (motion.accelerations != 0.0).any(axis=1)
-    last = int(np.flatnonzero(moving)[-1]) + 2 if moving.any() else 1
-    if last >= len(motion.times):
-        return motion
-    states = np.stack([motion.positions, motion.velocities, motion.accelerations])[:, :last]
-    return Trajectory(motion.times[:last], states[0], states[1], states[2], motion.joint_names)
-
-
-def _union(*times: Array) -> Array:
-    """Return all knots of motions, those that are nearly the same once, shape (K,) [s]."""
-    found = np.sort(np.concatenate(times))
-    kept: Array = found[np.append(True, np.diff(found) > NEAREST)]
-    return kept

@@ -142,8 +142,10 @@ def retime(
     """
     if motion.dof != kernel.robot.dof:
         raise ParameterError("motion", motion.dof, f"one of {kernel.robot.dof} joints")
-    for name, value in (("time", time), ("clock", clock), ("hold", hold), ("horizon", horizon)):
+    for name, value in (("time", time), ("clock", clock)):
         check_number(value, name)
+    for name, value in (("hold", hold), ("horizon", horizon)):
+        check_number(value, name, 0.0)
     query = Query(min(max(float(time), 0.0), motion.duration), float(clock), float(hold), float(horizon), deviation)
 
     def find(places: Array, start: float, end: float) -> Blocked:

@@ -13,6 +13,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.timing.trajectory import STOP_DEVIATION, Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.display import fields_line
+from apex_ompl.util.validation import check_array, check_number
 
 
 class Stop(NamedTuple):
@@ -54,7 +55,12 @@ def stop(limits: Limits, joint_names: tuple[str, ...], position: Array, velocity
         position: Shape (dof,) [rad; synergies 0..1].
         velocity: Within the limits, shape (dof,) [rad/s].
         acceleration: Within the limits, shape (dof,) [rad/s^2].
+
+    Raises:
+        ParameterError: One has another shape, or a number that is not finite.
     """
+    for name, values in (("position", position), ("velocity", velocity), ("acceleration", acceleration)):
+        check_array(np.asarray(values), (len(limits.velocity),), name, finite=True)
     times, knots, beyond = stop_joints(position, velocity, acceleration, LimitArrays.of(limits))
     return Stop(Trajectory.unchecked(times, knots, joint_names), beyond, np.inf)
 
@@ -70,7 +76,11 @@ def stop_along(motion: Trajectory, time: float, limits: Limits, deviation: float
         time: Time of the motion, from 0 to its end [s].
         limits: Limits of the joints.
         deviation: Largest distance of any joint from the path [rad].
+
+    Raises:
+        ParameterError: ``time`` is no finite number.
     """
+    check_number(time, "time")
     states, still = np.stack([motion.positions, motion.velocities, motion.accelerations]), np.zeros(motion.dof)
     found = stop_on_path(motion.times, states, time, LimitArrays.of(limits), deviation)
     if found is None:

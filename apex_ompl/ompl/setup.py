@@ -14,6 +14,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample, sample_on_constraints
@@ -214,8 +215,11 @@ def constraint_set(
         held: Numbers of the joints that stay as at the start.
 
     Raises:
+        ParameterError: ``constraints`` is no list.
         ApexError: A frame is unknown, or no planned joint moves it.
     """
+    if not isinstance(constraints, (list, tuple)):
+        raise ParameterError("constraints", constraints, "a list of constraints")
     if not (problem.constraints or constraints or any(one.links is not None for one in problem.attached)):
         return None
     from apex_ompl.constraints import paths  # noqa: F401 - which searches need: a fork waits for what is imported here
@@ -255,8 +259,17 @@ def _moved_notes(robot: Robot, asked: Array, moved: Array, what: str) -> list[st
 def _bounds(robot: Robot, start: Array, held: NDArray[np.intp]) -> Bounds:
     """Return the robot's limits, narrowed to the start for joints that stay, to a turn to either side if continuous."""
     lower, upper = robot.range_around(start, turns=1.0)
-    lower[held] = np.maximum(lower[held], start[held] - HELD_WIDTH)
-    upper[held] = np.minimum(upper[held], start[held] + HELD_WIDTH)
+    return held_range(lower, upper, start, held)
+
+
+def held_range(lower: Array, upper: Array, start: Array, held: NDArray[np.intp]) -> Bounds:
+    """Return limits of joints, shape (dof,) each, narrowed to the start for joints that stay.
+
+    A joint that is outside its limits at the start, which is a fault, has a narrow range at the limit.
+    """
+    at = start[held].clip(lower[held], upper[held])
+    lower, upper = lower.copy(), upper.copy()
+    lower[held], upper[held] = np.maximum(lower[held], at - HELD_WIDTH), np.minimum(upper[held], at + HELD_WIDTH)
     return lower, upper
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 from apex_ompl.errors import ParameterError
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
+from apex_ompl.util.arrays import distinct
 from apex_ompl.util.validation import check_integer, check_positive
 
 SEARCH_RESOLUTION = 0.031
@@ -175,3 +177,18 @@ def states_between(a: Array, b: Array, spacing: float) -> Array:
     """
     count = max(1, int(np.ceil(float(np.abs(b - a).max()) / spacing)))
     return np.asarray(a + (np.arange(1, count) / count)[:, None] * (b - a))
+
+
+def abreast(paths: Sequence[Array]) -> Array:
+    """Return the states of paths that are followed at once, each in proportion to its number of states, shape (N, dof).
+
+    Args:
+        paths: States from the same start, shape (M, dof) each.
+    """
+    shares = [np.linspace(0.0, 1.0, len(path)) for path in paths]
+    u = distinct(np.concatenate([np.array([0.0, 1.0]) if max(map(len, paths)) > 1 else np.zeros(1), *shares]))
+    q = np.tile(paths[0][0], (len(u), 1))
+    for path, share in zip(paths, shares, strict=True):
+        if len(path) > 1:
+            q += np.stack([np.interp(u, share, column) for column in (path - path[0]).T], axis=1)
+    return q

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from apex_ompl.planning.inverse_kinematics import IKSolution as IKSolution
     from apex_ompl.planning.planner import MotionPlanner as MotionPlanner
     from apex_ompl.planning.query import GoalSampler as GoalSampler
-    from apex_ompl.planning.schedules import ArmStep as ArmStep
-    from apex_ompl.planning.schedules import Schedule as Schedule
+    from apex_ompl.planning.schedule_records import ArmStep as ArmStep
+    from apex_ompl.planning.schedule_records import Schedule as Schedule
     from apex_ompl.planning.schedules import replaced as replaced
     from apex_ompl.planning.schedules import schedule as schedule
     from apex_ompl.planning.step_records import FoundPath as FoundPath
@@ -38,7 +38,8 @@ __all__, __getattr__, __dir__ = lazy_names(
         "inverse_kinematics": "IKResult IKSolution",
         "planner": "MotionPlanner",
         "query": "GoalSampler",
-        "schedules": "ArmStep Schedule replaced schedule",
+        "schedule_records": "ArmStep Schedule",
+        "schedules": "replaced schedule",
         "step_records": "FoundPath PlanQuery ProvedPath",
         "steps": "assemble check prove solve time",
         "tasks": "TaskSearch",

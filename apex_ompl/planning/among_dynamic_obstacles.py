@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from apex_ompl.robot.model import Limits
 from apex_ompl.scene.bodies import Obstacle, Sphere
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.motion_limits import MotionLimits
 from apex_ompl.timing.timed_spline import Start, TimedSpline
 from apex_ompl.util.clocks import Deadline, timed
 
@@ -68,6 +70,21 @@ class InTime:
     def stop(self) -> bool:
         """Whether time is up."""
         return self.query.ends()
+
+    @cached_property
+    def motion_limits(self) -> MotionLimits | None:
+        """The limits of torques and tool speeds, or None where there are none."""
+        setup = self.query.setup
+        return self.timing.motion_limits(setup.robot, setup.problem.attached, setup.problem.payload)
+
+    def is_over(self, motion: Trajectory) -> bool:
+        """Whether a motion of the planned joints exceeds a limit of torques or tool speeds."""
+        return self.motion_limits is not None and bool(self.motion_limits.fault(motion))
+
+    def use(self, motion: Trajectory) -> dict[str, float]:
+        """Return the largest share of each limit that a motion uses, those of torques and tool speeds, too."""
+        more = {} if self.motion_limits is None else self.motion_limits.use(motion)
+        return motion.use(self.query.setup.robot.limits) | more
 
     @property
     def start(self) -> Start:
@@ -117,10 +134,11 @@ class Among(InTime):
         """Return what a result says of the proof of a motion, or None.
 
         It is None where the motion is not proved to be clear of the static obstacles, of the dynamic ones and of
-        itself, does not keep the constraints, or does not go from the start to a goal.
+        itself, does not keep the constraints or the limits of torques and tool speeds, or does not go from the start
+        to a goal.
         """
         setup = self.query.setup
-        if not self.prover.prove(motion, stop=self.stop):
+        if self.is_over(motion) or not self.prover.prove(motion, stop=self.stop):
             return None
         along = setup.constraints
         check = full_check(
@@ -214,7 +232,7 @@ def _retimed(among: Among, still: PlanResult) -> PlanResult | None:
     return replace(
         still, trajectory=made.trajectory, solved_by=f"{still.solved_by}+{RETIMED}", timing_method=RETIMED,
         deviation=still.deviation + math.sqrt(motion.dof) * made.deviation,
-        limit_use=made.trajectory.use(among.query.setup.robot.limits), **fields,
+        limit_use=among.use(made.trajectory), **fields,
     )  # fmt: skip
 
 
@@ -321,7 +339,7 @@ def _result(among: Among, still: PlanResult, motion: Trajectory, method: str) ->
     solved_by = f"{still.solved_by}+{method}"
     exact = FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(states), solved_by, check.proof)
     return replace(
-        exact.result(), trajectory=motion, limit_use=motion.use(query.setup.robot.limits), timing_method=method,
+        exact.result(), trajectory=motion, limit_use=among.use(motion), timing_method=method,
         deviation=float(largest * (times[1] - times[0]) ** 2 / 8.0), **fields,
     )  # fmt: skip
 

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence, Set
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any, Self, Unpack
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 
     from apex_ompl.collision import CollisionChecker
     from apex_ompl.constraints.user import UserConstraint
-    from apex_ompl.ompl.setup import PlanningSetup
     from apex_ompl.paths.path import Path
     from apex_ompl.planners import AnyPlanner
     from apex_ompl.planning.checks import ProofResult, StateCheck
@@ -35,20 +33,15 @@ if TYPE_CHECKING:
     from apex_ompl.planning.line_query import Waypoint
     from apex_ompl.planning.lines import LineResult
     from apex_ompl.planning.query import Group, State, Target
-    from apex_ompl.planning.step_records import PlanQuery
     from apex_ompl.planning.task_result import TaskResult
     from apex_ompl.planning.tasks import TaskSearch
     from apex_ompl.result import PlanResult
     from apex_ompl.robot import Robot
-    from apex_ompl.scene.bodies import Obstacle
     from apex_ompl.scene.constraints import Constraint
     from apex_ompl.scene.problem import PoseTarget, Problem
     from apex_ompl.scene.steps import Step
     from apex_ompl.timing import Timing, Trajectory
     from apex_ompl.types import Array
-
-MOST_IDLE = 4  # planners of a robot that are kept
-_Stamps = tuple[int, ...]
 
 
 class MotionPlanner:
@@ -89,9 +82,9 @@ class MotionPlanner:
 
     def _set_up(self) -> None:
         with unforked():
-            from apex_ompl.planning import departure, query, steps  # noqa: F401 - with all that plans need
-        self._checker, self._lock = self.world.checker, self.world.lock
-        self._left: CollisionChecker | None = None  # of the world without some obstacles, from the last call
+            from apex_ompl.planning import one_motion  # noqa: F401 - with all that plans need
+            from apex_ompl.planning.world_checkers import WorldCheckers
+        self._checkers, self._lock = WorldCheckers(self.world), self.world.lock
 
     def __repr__(self) -> str:
         """Return the robot, a given model, and the contents of the world."""
@@ -146,17 +139,27 @@ class MotionPlanner:
             ApexError: The start, the goal, the planner, a parameter or the name of an option is faulty.
             KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
         """
+        from apex_ompl.planning.query import check_is_no_line
+
         started = time.perf_counter()
         check_options(options, OPTIONS)
         with running(), self._lock:
             given = PlanOptions(group=group, **options)
-            if while_executing is not None:
-                return self._plan_while(
-                    start, goal, planner, started, given, name=name, motion=while_executing, offset=offset
-                )
-            problem = self.problem(start, goal, name, group, given.seed)
-            _check_is_no_line(problem)
-            return self._plan(problem, planner, started, given)
+            if while_executing is None:
+                if offset != 0.0:
+                    raise ParameterError("offset", offset, "0 without while_executing")
+                problem = self.problem(start, goal, name, group, given.seed)
+                check_is_no_line(problem)
+                return self._plan(problem, planner, started, given)
+            with unforked():
+                from apex_ompl.planning.while_executing import Asked, plan_beside
+
+            asked = Asked.of(self.robot, start, group, while_executing, offset)
+            problem = self.problem(asked.at_end, goal, name, asked.planned, given.seed)
+            problem = problem.model_copy(update={"goal": asked.goal_at_end(problem.goal)})
+            check_is_no_line(problem)
+            self._checkers.check_still()
+            return plan_beside(self._checkers, problem, asked, planner, given, model=self.model, started=started)
 
     def plan_problem(
         self, problem: Problem, planner: AnyPlanner | None = None, **options: Unpack[ProblemKeywords]
@@ -171,9 +174,12 @@ class MotionPlanner:
         Raises:
             ApexError: The problem, the planner, a parameter or the name of an option is faulty.
         """
+        from apex_ompl.planning.query import check_is_no_line, check_problem
+
         started = time.perf_counter()
         check_options(options, OPTIONS)
-        _check_is_no_line(problem)
+        check_problem(problem)
+        check_is_no_line(problem)
         with running(), self._lock:
             with unforked():
                 self.world.load(problem)
@@ -191,7 +197,7 @@ class MotionPlanner:
         Args:
             start: The start.
             steps: The steps: records of :mod:`apex_ompl.scene`, or entries of ``after`` in problem files. The goal of a
-                ``move`` may be any goal of :meth:`plan`.
+                ``move`` may be any goal of :meth:`plan` but an object that draws states.
             planner: A planner; see :func:`apex_ompl.plan`.
             name: Name of the problem in the result.
             search: How goals are chosen.
@@ -205,7 +211,7 @@ class MotionPlanner:
 
         check_options(options, OPTIONS)
         with running(), self._lock:
-            self._check_nothing_moves()
+            self._checkers.check_still()
             problem = sequence_problem(self.robot, self.problem(start, start, name), steps)
             return self._plan_task(problem, planner, search, options)
 
@@ -245,132 +251,15 @@ class MotionPlanner:
             now = replace(given if first else given.from_rest(), timeout=timeout, group=group)
             return self._plan(goals, planner, time.perf_counter(), now)
 
-        return plan_task(self._checker, with_lines(problem), given, plan_to, search)
+        return plan_task(self.world.checker, with_lines(problem), given, plan_to, search)
 
     def _plan(
         self, problem: Problem, planner: AnyPlanner | None, started: float, options: PlanOptions
     ) -> PlanResult:  # fmt: skip
-        """Take the five steps of a plan in the world as it is now, while the lock is held.
+        """Plan in the world as it is now, while the lock is held; see :func:`apex_ompl.planning.one_motion.plan`."""
+        from apex_ompl.planning import one_motion
 
-        Args:
-            problem: The problem, whose bodies are in the world.
-            planner: A planner; apex by default.
-            started: Value of ``time.perf_counter`` when the call started [s].
-            options: The options.
-
-        Raises:
-            ApexError: The planner, a parameter or an option is faulty.
-            KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
-        """
-        with unforked():
-            from apex_ompl.apex.model_search import model_notes
-            from apex_ompl.apex.parameters import NAME
-            from apex_ompl.collision.conservative import CheckCounts
-            from apex_ompl.ompl.process import Interrupt, quiet_ompl
-            from apex_ompl.planning import motions, steps
-            from apex_ompl.planning.departure import departed, with_departure
-            from apex_ompl.planning.query import dynamic_of, robot_notes, snapshot_notes
-            from apex_ompl.timing import Timing
-
-        options.check()
-        robot, leave_contact = self.robot, options.leave_contact
-        timing = Timing() if options.timing is True else options.timing or None
-        changing = self._checker.changing_obstacles
-        dynamic = () if options.snapshot else dynamic_of(changing)
-        if dynamic:
-            _check_among(dynamic[0], timing, leave_contact)
-        with quiet_ompl(), ExitStack() as preparing:
-            preparing.enter_context(unforked())
-            notes = snapshot_notes(changing) if options.snapshot else []
-            if planner is None and self.model is None and "model" not in (options.params or {}):
-                notes += model_notes(robot)
-            parameters = planners.chosen(
-                NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
-            )
-            derivatives = None
-            if timing is not None:
-                derivatives = timing.start(timing.limits(robot.limits, robot.joint_names))  # checked before planning
-                timing.motion_limits(robot, problem.attached, problem.payload)  # checked before planning
-                if derivatives is not None and leave_contact:
-                    raise ParameterError("leave_contact", leave_contact, "0 for a start that moves")
-            checker = self._checker_without({o.name for o in dynamic} if dynamic else self._absent())
-            checker.check_counts = CheckCounts()
-            given = steps.assemble(
-                problem, robot, seed=options.seed, group=options.group, checker=checker, constraints=options.constraints
-            )
-            departure, setup = departed(given, leave_contact, options.seed) if leave_contact else (None, given)
-            notes += [*robot_notes(robot), *given.notes]
-            notes += [note for note in self._checker.mesh_notes if note not in given.notes]
-            if timing is not None:
-                motions.warm_up(checker)
-            if dynamic:
-                from apex_ompl.planning import among_dynamic_obstacles
-
-                among_dynamic_obstacles.warm_up(checker)
-            times = {"setup": time.perf_counter() - started}
-            query = steps.check(
-                setup, parameters, timeout=options.timeout, objective=options.objective,
-                calm_factor=options.calm_factor, timing=timing is not None and not dynamic and derivatives is None,
-                started=started, times=times, notes=notes,
-            )  # fmt: skip
-            preparing.close()
-            with Interrupt() as query.interrupt, running(query.interrupt.end):
-                if dynamic and timing is not None:
-                    result = among_dynamic_obstacles.plan_among_dynamic_obstacles(
-                        query, dynamic, options.simplify, timing
-                    )
-                else:
-                    result = steps.time(steps.prove(steps.solve(query), options.simplify), timing or False)
-            if departure is not None:
-                result = steps.finish(query, with_departure(result, given, departure, timing))
-            return result
-
-    def _plan_while(
-        self, start: State, goal: Target, planner: AnyPlanner | None, started: float, options: PlanOptions, *,
-        name: str, motion: Trajectory, offset: float,
-    ) -> PlanResult:  # fmt: skip
-        """Plan while other joints execute a motion, while the lock is held; see :meth:`plan`."""
-        with unforked():
-            from apex_ompl.apex.parameters import NAME
-            from apex_ompl.collision.conservative import CheckCounts
-            from apex_ompl.ompl.process import Interrupt, quiet_ompl, seed_ompl
-            from apex_ompl.planning import among_dynamic_obstacles, motions, steps, while_executing
-            from apex_ompl.timing import Timing
-
-        options.check()
-        if not options.timing or options.leave_contact:
-            wanted = "True or a Timing, and no contact to leave, with while_executing"
-            raise ParameterError("timing", options.timing, wanted)
-        timing = Timing() if options.timing is True else options.timing
-        parameters = planners.chosen(
-            NAME if planner is None else planner, options.params, model=self.model, seed=options.seed
-        )
-        asked = while_executing.Asked.of(self.robot, start, options.group, motion, offset)
-        problem = self.problem(asked.at_end, goal, name, asked.planned, options.seed)
-        problem = problem.model_copy(update={"goal": asked.goal_at_end(problem.goal)})
-        _check_is_no_line(problem)
-        self._check_nothing_moves()
-        with quiet_ompl(), Interrupt() as interrupt, running(interrupt.end):
-            with unforked():
-                checker = self._checker_without(self._absent())
-                checker.check_counts = CheckCounts()
-                motions.warm_up(checker)
-                among_dynamic_obstacles.warm_up(checker)
-                seed_ompl(options.seed)
-
-            def query_of(setup: PlanningSetup) -> PlanQuery:
-                query = steps.check(
-                    setup, parameters, timeout=options.timeout, objective=options.objective,
-                    calm_factor=options.calm_factor, started=started, notes=setup.notes,
-                    times={"setup": time.perf_counter() - started},
-                )  # fmt: skip
-                query.interrupt = interrupt
-                return query
-
-            return while_executing.plan_while_executing(
-                query_of, problem, checker, asked, simplify=options.simplify, timing=timing, seed=options.seed,
-                constraints=options.constraints,
-            )  # fmt: skip
+        return one_motion.plan(self._checkers, problem, planner, options, model=self.model, started=started)
 
     def plan_line(
         self, start: State, pose: Waypoint | Sequence[Waypoint], *, frame: str | None = None,
@@ -411,8 +300,8 @@ class MotionPlanner:
         check_arguments(timeout, 0)
         with running(), self._lock:
             with unforked():
-                self._check_nothing_moves()
-                checker = self._checker_without(self._absent())
+                self._checkers.check_still()
+                checker = self._checkers.now()
                 checker.check_counts = CheckCounts()
                 query = line_query(
                     checker, state_array(self.robot, start, "start"), pose, frame=frame, blend=blend, speed=speed,
@@ -471,7 +360,7 @@ class MotionPlanner:
 
         q = state_array(self.robot, state, "state")
         with self._lock:
-            return self.robot.limit_fault(q) is None and self._checker_now().is_free(q)
+            return self.robot.limit_fault(q) is None and self._checkers.now().is_free(q)
 
     def check(self, state: State) -> StateCheck:
         """Check a state in the world as it is now, without obstacles that are yet to appear.
@@ -484,7 +373,7 @@ class MotionPlanner:
 
         q = state_array(self.robot, state, "state")
         with self._lock:
-            return check_state(self._checker_now(), q)
+            return check_state(self._checkers.now(), q)
 
     def fk(self, state: State, frame: str) -> Array:
         """Return the pose of a frame in the world at a state, shape (4, 4) [m].
@@ -544,7 +433,7 @@ class MotionPlanner:
         fixed = np.array([k for k, joint in enumerate(self.robot.joint_names) if joint not in moving], np.intp)
         with running(), self._lock:
             return solve(
-                self._checker_now(), poses, base.clip(limits.lower, limits.upper), fixed,
+                self._checkers.now(), poses, base.clip(limits.lower, limits.upper), fixed,
                 by_distance=near is not None, count=count, descents=descents, seed=seed,
             )  # fmt: skip
 
@@ -569,8 +458,8 @@ class MotionPlanner:
         from apex_ompl.planning.checks import prove
 
         with running(), self._lock:
-            self._check_nothing_moves()
-            return prove(self._checker_now(), path, lambda start: self.problem(start, start), constraints)
+            self._checkers.check_still()
+            return prove(self._checkers.now(), path, lambda start: self.problem(start, start), constraints)
 
     @property
     def checker(self) -> CollisionChecker:
@@ -578,7 +467,7 @@ class MotionPlanner:
 
         It follows edits of the world; ask it while no other thread edits, or in ``with planner.world.locked()``.
         """
-        return self._checker_now()
+        return self._checkers.now()
 
     def simple_setup(
         self, start: State, goal: Target, *, constraints: Sequence[Constraint | UserConstraint] = ()
@@ -600,109 +489,7 @@ class MotionPlanner:
         from apex_ompl.ompl.setup import assemble
 
         with self._lock:
-            checker = self._checker_without(self._absent(), kept=False)
+            checker = self._checkers.now(kept=False)
             ready = assemble(self.problem(start, goal), self.robot, checker=checker, constraints=constraints)
         ready.simple_setup.setPlannerAllocator(planners.allocator(NAME))
         return ready.simple_setup
-
-    def _checker_now(self) -> CollisionChecker:
-        """Return a checker of the world at time 0."""
-        return self._checker_without(self._absent())
-
-    def _check_nothing_moves(self) -> None:
-        """Check that no obstacle moves.
-
-        Raises:
-            ParameterError: One does.
-        """
-        for obstacle in self._checker.changing_obstacles:
-            if obstacle.moving:
-                raise ParameterError("world", f"the moving obstacle {obstacle.name!r}", "obstacles that stand still")
-
-    def _absent(self) -> set[str]:
-        """Return the names of the obstacles that are not there at time 0."""
-        changing = self._checker.changing_obstacles
-        if not changing:
-            return set()
-        from apex_ompl.scene.scripts import is_there
-
-        return {o.name for o in changing if not is_there(o, 0.0)}
-
-    def _checker_without(self, names: Set[str], *, kept: bool = True) -> CollisionChecker:
-        """Return a checker of the world without some obstacles, which is the world's own where there are none.
-
-        Args:
-            names: Names of these obstacles.
-            kept: Whether the checker of the last call may be reused; it is updated by the changes since then.
-        """
-        if not names:
-            return self._checker
-        from apex_ompl.collision import CollisionChecker
-
-        scene = {name: body for name, body in self.world.obstacles.items() if name not in names}
-        held, pairs = self.world.held, [pair for pair in self.world.allowed if names.isdisjoint(pair)]
-        if kept and self._left is not None:
-            self._left.become(scene, held, pairs)
-            if [*self._left.obstacles] == [*scene] and [*self._left.held] == [*held]:  # as in one that is made anew
-                return self._left
-        made = CollisionChecker(self.robot, scene.values(), held.values(), pairs)
-        self._left = made if kept else self._left
-        return made
-
-
-def _check_is_no_line(problem: Problem) -> None:
-    """Check that a goal has no approach.
-
-    Raises:
-        ParameterError: It has one.
-    """
-    for frame, approach in problem.goal.approaches.items():
-        raise ParameterError(
-            "goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task (apex-ompl sequence)"
-        )
-
-
-def _check_among(obstacle: Obstacle, timing: Timing | None, leave_contact: float) -> None:
-    """Check that options go with an obstacle that moves.
-
-    Raises:
-        ParameterError: The motion is not timed, or leaves a contact.
-    """
-    if timing is None:
-        raise ParameterError("timing", False, f"True or a Timing, since the obstacle {obstacle.name!r} moves")
-    if leave_contact:
-        raise ParameterError("leave_contact", leave_contact, f"0, since the obstacle {obstacle.name!r} moves")
-
-
-_idle: dict[str, list[tuple[MotionPlanner, _Stamps]]] = {}
-_idle_lock = ProcessLock()
-
-
-@contextmanager
-def kept_planner(robot: str) -> Iterator[MotionPlanner]:
-    """Lend a planner of a robot, by name or file, that no other thread uses; it is made where there is none.
-
-    A planner is not lent again once a file of its robot has changed, meshes included.
-
-    Raises:
-        ApexError: The robot is unknown, or one of its files is faulty.
-    """
-    key = os.path.abspath(robot) if robot.endswith((".yaml", ".yml")) else robot
-    with _idle_lock:
-        idle = _idle.get(key, [])
-        found = idle.pop() if idle else None
-    if found is None or found[1] != _stamps(found[0]):
-        planner = MotionPlanner(robot)
-        found = planner, _stamps(planner)
-    try:
-        yield found[0]
-    finally:
-        with _idle_lock:
-            mine = _idle.setdefault(key, [])
-            if len(mine) < MOST_IDLE:
-                mine.append(found)
-
-
-def _stamps(planner: MotionPlanner) -> _Stamps:
-    """Return when the files of a planner's robot were written, 0 for one that is gone [ns]."""
-    return tuple(file.stat().st_mtime_ns if file.exists() else 0 for file in planner.robot.files)

@@ -13,7 +13,7 @@ from apex_ompl.collision.proved_share import share_note
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.problem import Alignment, Goal, PoseTarget
+from apex_ompl.scene.problem import Alignment, Goal, PoseTarget, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_name, finite_array
@@ -43,6 +43,16 @@ class AnyOf:
     """
 
     goals: Sequence[Any]
+
+    def __post_init__(self) -> None:
+        """Check that there are several.
+
+        Raises:
+            ParameterError: It is one goal, or none.
+        """
+        if isinstance(self.goals, str | Mapping) or not isinstance(self.goals, Iterable):
+            raise ParameterError("goal", self.goals, "several goals in AnyOf")
+        object.__setattr__(self, "goals", tuple(self.goals))
 
 
 Group = str | Sequence[str]
@@ -114,7 +124,8 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
     Args:
         robot: The robot.
         target: The goal.
-        held: Values of joints that stay; a goal by joint names may leave them out.
+        held: Values of joints that stay; a goal by joint names may leave them out, and poses of the robot do not count
+            there.
 
     Raises:
         ParameterError: A state has not the robot's shape, or there is none.
@@ -123,17 +134,20 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
     if isinstance(target, Goal):
         return target
     if isinstance(target, AnyOf):
-        if isinstance(target.goals, str | Mapping) or not isinstance(target.goals, Iterable):
-            raise ParameterError("goal", target.goals, "several goals in AnyOf")
         records = [goal_record(robot, one, held) for one in target.goals]
         return validate(Goal, {"any_of": tuple(records)}, "goal")
     if isinstance(target, Alignment):
         return Goal(alignment=target)
     if isinstance(target, PoseTarget):
         return Goal(poses=(target,))
+    if isinstance(target, GoalSampler):
+        raise ParameterError("goal", target, "no object that draws states, which is a goal of plans alone")
     if isinstance(target, Sequence) and target and all(isinstance(one, PoseTarget) for one in target):
         return validate(Goal, {"poses": tuple(target)}, "goal")
-    several = [dict(held) | joint_values(robot, one, "goal") for one in _several(target)]
+    several = list[dict[str, float]]()
+    for one in _several(target):
+        values = joint_values(robot, one, "goal")
+        several.append(values | dict(held) if isinstance(one, str) else dict(held) | values)
     if not several:
         raise ParameterError("goal", target, "a state, or several")
     return Goal(joints=tuple(several))
@@ -169,6 +183,8 @@ def sampled_goals(
 def _several(target: Any) -> Sequence[Any]:
     if isinstance(target, str | Mapping):
         return [target]
+    if isinstance(target, Sequence) and any(isinstance(one, PoseTarget | Alignment | Goal | AnyOf) for one in target):
+        raise ParameterError("goal", target, "states alone, poses alone, or AnyOf of both")
     if isinstance(target, Sequence) and target and any(isinstance(one, str | Mapping) for one in target):
         return target
     values = finite_array(target, "goal")
@@ -206,6 +222,39 @@ def dynamic_of(obstacles: Iterable[Obstacle]) -> tuple[Obstacle, ...]:
             "snapshot", False, f"True, since the obstacle {scripted!r} follows a script, which `apex-ompl run` runs"
         )
     return dynamic
+
+
+def check_problem(problem: Problem) -> None:
+    """Check that a problem is one.
+
+    Raises:
+        ParameterError: It is something else, such as its name.
+    """
+    if not isinstance(problem, Problem):
+        raise ParameterError("problem", problem, "a Problem, as load_problem returns")
+
+
+def check_is_no_line(problem: Problem) -> None:
+    """Check that a goal has no approach.
+
+    Raises:
+        ParameterError: It has one.
+    """
+    for frame, approach in problem.goal.approaches.items():
+        raise ParameterError(
+            "goal", f"the approach {approach} of {frame}", "no approach, or a plan by plan_task (apex-ompl sequence)"
+        )
+
+
+def check_still(obstacles: Iterable[Obstacle]) -> None:
+    """Check that no obstacle moves.
+
+    Raises:
+        ParameterError: One does.
+    """
+    for obstacle in obstacles:
+        if obstacle.moving:
+            raise ParameterError("world", f"the moving obstacle {obstacle.name!r}", "obstacles that stand still")
 
 
 def robot_notes(robot: Robot) -> list[str]:

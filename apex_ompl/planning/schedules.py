@@ -11,117 +11,46 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from apex_ompl.errors import ParameterError
-from apex_ompl.moving.given_motion import GivenMotion, rest, together, until_rest
+from apex_ompl.errors import ApexError, ParameterError
+from apex_ompl.moving.given_motion import GivenMotion
+from apex_ompl.ompl.setup import state_fault, workspace_goal
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
-from apex_ompl.planning.query import Target, joint_values, planned_joints, state_array
+from apex_ompl.planning.query import GoalSampler, check_is_no_line, check_still, planned_joints, state_array
+from apex_ompl.planning.schedule_records import (
+    MODES,
+    ArmStep,
+    Mode,
+    Schedule,
+    ScheduledStep,
+    check_are_steps,
+    check_disjoint,
+    check_steps,
+)
 from apex_ompl.planning.step_records import certificate
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot.model import digest
-from apex_ompl.timing import Trajectory
+from apex_ompl.timing import Timing, Trajectory
+from apex_ompl.timing.combination import rest, together, until_rest
 from apex_ompl.timing.trajectory import joined
-from apex_ompl.util.display import one_line
-from apex_ompl.util.validation import check_integer, check_name, check_number, check_positive, check_seed
+from apex_ompl.types import Array
+from apex_ompl.util.validation import check_integer, check_name, check_options, check_positive, check_seed
 
 if TYPE_CHECKING:
     from apex_ompl.planning.planner import MotionPlanner
     from apex_ompl.planning.query import State
 
-Mode = Literal["asynchronous", "synchronous", "sequential"]
-MODES: tuple[Mode, ...] = ("asynchronous", "synchronous", "sequential")
-"""When a motion starts: as soon as what it needs is done; with those of the other arms; when all others have ended."""
-
 PLAN_SECONDS = 2.0  # largest time for one motion [s]
+OPTIONS = ("simplify", "params", "timing", "objective", "calm_factor", "constraints")
+"""Options of plans that motions of a schedule take."""
 MOST_FAULTS = 3  # that a reason gives
 GREEDY = 0.5  # share of choices that are greedy after the first order
 LEAST_GAIN = 1e-6  # of a makespan [s]
-PATH_SPACING = 0.02  # of the states of the path along the whole motion [s]
-
-
-@dataclass(frozen=True)
-class ArmStep:
-    """One motion of an arm.
-
-    Attributes:
-        name: Its name, which no other step has.
-        group: The group of joints that it moves.
-        goal: Where to: a goal of :meth:`apex_ompl.MotionPlanner.plan` for that group.
-        after: Names of steps of other arms that have to be done before it starts.
-        hold: Time for which the arm stays there then [s].
-    """
-
-    name: str
-    group: str
-    goal: Target
-    after: tuple[str, ...] = ()
-    hold: float = 0.0
-
-
-@dataclass(frozen=True)
-class ScheduledStep:
-    """When a step is done.
-
-    Attributes:
-        name: Its name.
-        group: Its group.
-        start: Time at which it may start [s]; the arm may wait then.
-        end: Time at which the arm rests at its goal, and has held it [s].
-    """
-
-    name: str
-    group: str
-    start: float
-    end: float
-
-
-@dataclass(frozen=True, eq=False)
-class Schedule:
-    """A schedule; true where all steps are planned and the motion of all joints is proved.
-
-    Attributes:
-        result: The whole as the result of a plan: status, reason, and the proved motion of all joints.
-        steps: The steps by their start.
-        motions: Motion of each group from time 0 to its last step's end.
-        mode: When motions start.
-        orders: Number of complete orders that were examined.
-        plans: Number of motions that were planned.
-    """
-
-    result: PlanResult
-    steps: tuple[ScheduledStep, ...]
-    motions: Mapping[str, Trajectory]
-    mode: Mode
-    orders: int
-    plans: int
-
-    def __bool__(self) -> bool:
-        """Whether all steps are planned and proved."""
-        return bool(self.result)
-
-    def __repr__(self) -> str:
-        """Return the status, the steps and the makespan."""
-        names = ", ".join(step.name for step in self.steps)
-        return one_line("Schedule", self.mode, str(self.result.status), names, f"{self.makespan:.3f} s", self.reason)
-
-    @property
-    def reason(self) -> str:
-        """Why there is no schedule, in one sentence."""
-        return self.result.reason
-
-    @property
-    def trajectory(self) -> Trajectory | None:
-        """The motion of all joints, or None."""
-        return self.result.trajectory
-
-    @property
-    def makespan(self) -> float:
-        """Time at which the last step ends [s]; NaN without steps."""
-        return max((step.end for step in self.steps), default=float("nan"))
+PATH_SPACINGS = (0.02, 0.005, 0.001)  # of the states of the path along the whole motion, the first that is proved [s]
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,22 +95,20 @@ def schedule(
         mode: When motions start: ``asynchronous``, as soon as what they need is done; ``synchronous``, those of all
             arms together, when all have ended; ``sequential``, one at a time.
         most_plans: Number of planned motions after which no further order is begun; by default time alone ends that.
-        **options: Further ones of :meth:`apex_ompl.MotionPlanner.plan`.
+        **options: Of :meth:`apex_ompl.MotionPlanner.plan`: ``simplify``, ``params``, ``timing``, ``objective``,
+            ``calm_factor``, ``constraints``.
 
     Raises:
-        ApexError: A step or an option is faulty.
+        ApexError: A step or an option is faulty, or an obstacle moves.
     """
     check_positive(timeout, "timeout", "a positive number of seconds")
-    check_seed(seed)
+    _check_options(seed, options)
     check_name(mode, "mode", MODES)
     if most_plans is not None:
         check_integer(most_plans, "most_plans", 1)
     until = time.perf_counter() + timeout
     how = _How(mode, seed, options, until, np.inf if most_plans is None else most_plans)
-    search = _Search(planner, start, steps, how)
-    with planner.world.locked():
-        best = search.best()
-        return search.schedule(best)
+    return _Search(planner, start, steps, how).found()
 
 
 def replaced(
@@ -190,6 +117,9 @@ def replaced(
 ) -> Schedule:  # fmt: skip
     """Return a schedule with other steps of one arm, while the others go on as they were planned.
 
+    Steps of the others that wait for one that is replaced still do: one of that name has to be among the new steps, and
+    done before they start.
+
     Args:
         planner: The planner with its world.
         known: The schedule.
@@ -197,22 +127,32 @@ def replaced(
         steps: Its new steps, which may wait for steps of the others.
         after: Name of its last step that is kept, in the middle of which it may be; by default none is.
         seed: Seed of the plans.
-        **options: Further ones of :meth:`apex_ompl.MotionPlanner.plan`.
+        **options: As of :func:`schedule`.
 
     Raises:
-        ApexError: A step is faulty, or the schedule has none of that name.
+        ApexError: A step is faulty, the schedule has none of that name, or an obstacle moves.
     """
+    _check_options(seed, options)
+    if not isinstance(known, Schedule) or not known:
+        raise ParameterError("known", known, "a schedule that was found")
     check_name(group, "group", known.motions)
+    check_are_steps(steps)
+    for step in steps:
+        if step.group != group:
+            raise ParameterError("steps", f"{step.name!r} of {step.group}", f"steps of {group} alone")
     mine = [step for step in known.steps if step.group == group]
     if after is not None:
         check_name(after, f"step of {group}", [step.name for step in mine])
     end = 0.0 if after is None else next(step.end for step in mine if step.name == after)
     kept = tuple(step for step in known.steps if step.group != group or step.end <= end)
     motions = {**known.motions, group: known.motions[group].before(end)}
+    done = [*(step.name for step in kept), *(step.name for step in steps)]
+    for waiting in kept:
+        for name in waiting.after:
+            if name not in done:
+                raise ParameterError("steps", ", ".join(done), f"a step {name!r}, which {waiting.name!r} waits for")
     first = known.result.problem.start_state(planner.robot.joint_names)
-    search = _Search(planner, first, steps, _How("asynchronous", seed, options), _Node(motions, kept))
-    with planner.world.locked():
-        return search.schedule(search.best())
+    return _Search(planner, first, steps, _How("asynchronous", seed, options), _Node(motions, kept)).found()
 
 
 class _How(NamedTuple):
@@ -242,14 +182,14 @@ class _Search:
         """Check the steps, which are added to those of ``root``."""
         robot = planner.robot
         self._planner, self._how = planner, how
-        known = () if root is None else root.done
-        _check_steps(steps, known)
-        values = joint_values(robot, start, "start")
-        self.start = state_array(robot, values, "start")
+        check_steps(steps, () if root is None else root.done)
+        self.start = robot.within_limits(state_array(robot, start, "start"))
         self._joints = {step.group: planned_joints(robot, step.group) for step in steps}
         if root is not None:
             self._joints |= {group: motion.joint_names for group, motion in root.motions.items()}
-        _check_disjoint(self._joints)
+        check_disjoint(self._joints)
+        for step in steps:
+            _check_goal(planner, self.start, step)
         self._steps = {group: [step for step in steps if step.group == group] for group in self._joints}
         if root is None:
             still = {group: self._standing(names) for group, names in self._joints.items()}
@@ -262,7 +202,20 @@ class _Search:
         columns = [self._planner.robot.joint_names.index(name) for name in names]
         return rest(self.start[columns], 0.0, names)
 
-    def best(self) -> _Node | None:
+    def found(self) -> Schedule:
+        """Return the schedule with the shortest makespan, while nobody edits the world."""
+        planner = self._planner
+        with planner.world.locked():
+            check_still(planner.world.checker.changing_obstacles)
+            if fault := state_fault(planner.checker, self.start):
+                return self._schedule(None, PlanStatus.INVALID_START, fault)
+            best = self._best()
+            if best is not None:
+                return self._schedule(best, PlanStatus.EXACT_SOLUTION, "")
+            faults = "; ".join([*dict.fromkeys(self.faults)][-MOST_FAULTS:])
+            return self._schedule(None, PlanStatus.STEP_FAILED, f"no order of the steps was found: {faults}")
+
+    def _best(self) -> _Node | None:
         """Return the node of the best complete order, or None."""
         rng, best = np.random.default_rng(self._how.seed), None
         while () not in self._closed:
@@ -345,44 +298,61 @@ class _Search:
         return node.end, node.end, frozenset({step.group})
 
     def _planned(self, node: _Node, step: ArmStep) -> _Node | str:
-        """Return what is planned with one more step, or why that cannot be."""
-        begin, clock, moved = self._start(node, step)
-        group, names = step.group, self._joints[step.group]
-        robot, own = self._planner.robot, node.motions[step.group]
-        others = [motion for other, motion in node.motions.items() if other != group]
-        now = dict(zip(robot.joint_names, self.start.tolist(), strict=True))
-        for motion in (own, *others):
-            now |= dict(zip(motion.joint_names, motion(begin).tolist(), strict=True))
-        beside = together(others) if others and max(m.duration for m in others) > begin else None
-        left = max(self._how.until - time.perf_counter(), 0.1) if self.orders else PLAN_SECONDS
-        given: dict[str, Any] = {} if beside is None else {"while_executing": beside, "offset": begin}
-        options = {"timeout": min(PLAN_SECONDS, left), "seed": self._how.seed, **self._how.options, **given}
-        self.plans += 1
-        result = self._planner.plan(now, step.goal, group=group, **options)
+        """Return what is planned with one more step, or why that cannot be.
+
+        Where no motion beside those of the others is found, the arm waits until they rest.
+        """
+        start, clock, moved = self._start(node, step)
+        names, own = self._joints[step.group], node.motions[step.group]
+        begin, rested = start, max(motion.duration for motion in node.motions.values())
+        result = self._plan(node, step, begin)
+        if not result and result.status is not PlanStatus.INVALID_GOAL and begin < rested and self._waits(node, begin):
+            begin, result = rested, self._plan(node, step, rested)
         if not result or result.trajectory is None:
             return f"{step.name}: {result.reason}"
         motion = until_rest(result.trajectory.selected(names))
         parts = [own, rest(own.positions[-1], begin - own.duration, names), motion]
         whole = joined([*parts, rest(motion.positions[-1], step.hold, names)])
-        done = ScheduledStep(step.name, group, begin, whole.duration)
-        return _Node({**node.motions, group: whole}, (*node.done, done), clock, moved)
+        done = ScheduledStep(step.name, step.group, start, whole.duration, tuple(step.after))
+        for waiting in node.done:
+            if step.name in waiting.after and waiting.start < done.end:
+                return f"{step.name}: it ends at {done.end:.3f} s, and {waiting.name} starts at {waiting.start:.3f} s"
+        return _Node({**node.motions, step.group: whole}, (*node.done, done), clock, moved)
 
-    def schedule(self, node: _Node | None) -> Schedule:
-        """Return the schedule of a complete order, proved as one motion of all joints."""
+    def _plan(self, node: _Node, step: ArmStep, begin: float) -> PlanResult:
+        """Return the plan of a step from a time on [s], beside what the other arms do then."""
+        others = [motion for group, motion in node.motions.items() if group != step.group]
+        moving = any(motion.duration > begin for motion in others)
+        left = max(self._how.until - time.perf_counter(), 0.1) if self.orders else PLAN_SECONDS
+        given: dict[str, Any] = {"while_executing": together(others), "offset": begin} if moving else {}
+        options = {"timeout": min(PLAN_SECONDS, left), "seed": self._how.seed, **self._how.options, **given}
+        self.plans += 1
+        state = dict(zip(self._planner.robot.joint_names, self._motion(node)(begin).tolist(), strict=True))
+        return self._planner.plan(state, step.goal, group=step.group, **options)
+
+    def _waits(self, node: _Node, begin: float) -> bool:
+        """Whether an arm that rests from a time on [s] is proved free until the others rest."""
+        if self._how.options.get("constraints"):
+            return False
+        return bool(full_check(self._planner.checker, self._motion(node).after(begin)))
+
+    def _motion(self, node: _Node) -> Trajectory:
+        """Return the motion of all joints."""
+        still = rest(self.start, 0.0, self._planner.robot.joint_names)
+        return GivenMotion.of(self._planner.robot, together([*node.motions.values()])).combined(still)
+
+    def _schedule(self, node: _Node | None, status: PlanStatus, reason: str) -> Schedule:
+        """Return the schedule of a complete order, proved as one motion of all joints, or why there is none."""
         reached = node if node is not None else self._nodes[()]
         assert isinstance(reached, _Node)
         planner, robot = self._planner, self._planner.robot
-        still = rest(self.start, 0.0, robot.joint_names)
-        motion = GivenMotion.of(robot, together([*reached.motions.values()])).combined(still)
+        motion = self._motion(reached)
         problem = planner.problem(motion.positions[0], motion.positions[-1], "schedule")
-        faults = [*dict.fromkeys(self.faults)][-MOST_FAULTS:]
         result = PlanResult(
-            status=PlanStatus.TIMEOUT, reason=f"no order of the steps was found: {'; '.join(faults)}",
-            problem=problem, robot=robot.name, joint_names=robot.joint_names, planner="schedule", seed=self._how.seed,
-            robot_digest=digest(robot),
+            status=status, reason=reason, problem=problem, robot=robot.name, joint_names=robot.joint_names,
+            planner="schedule", seed=self._how.seed, robot_digest=digest(robot),
         )  # fmt: skip
-        if node is not None:
-            result = self._proved(replace(result, reason=""), motion)
+        result = result if node is None else self._proved(result, motion)
         steps = tuple(sorted(reached.done, key=lambda step: (step.start, step.end))) if node is not None else ()
         return Schedule(result, steps, dict(reached.motions), self._how.mode, self.orders, self.plans)
 
@@ -391,51 +361,50 @@ class _Search:
         checker = self._planner.checker
         check = full_check(checker, motion, motion.positions[0])
         if not check or check.proof is None:
-            return replace(result, reason=f"the motion of all joints is not proved, {check.reason}")
-        path = Path(motion(np.linspace(0.0, motion.duration, max(2, int(motion.duration / PATH_SPACING)))))
+            reason = f"the motion of all joints is not proved, {check.reason}"
+            return replace(result, status=PlanStatus.TIMEOUT, reason=reason)
+        for spacing in PATH_SPACINGS:
+            states = motion(np.linspace(0.0, motion.duration, max(2, int(np.ceil(motion.duration / spacing)) + 1)))
+            along = full_check(checker, states)
+            if along and along.proof is not None:
+                break
+        else:
+            reason = f"the path along the motion is not proved, {along.reason}"
+            return replace(result, status=PlanStatus.TIMEOUT, reason=reason)
+        path = Path(states)
         return replace(
-            result, status=PlanStatus.EXACT_SOLUTION, path=path, length=path.length, trajectory=motion,
-            solved_by=self._how.mode, timing_method="schedule", limit_use=motion.use(self._planner.robot.limits),
-            motion_clearance=check.proof.clearance, **certificate(check.proof),
+            result, path=path, length=path.length, trajectory=motion, solved_by=self._how.mode,
+            timing_method="schedule", limit_use=motion.use(self._planner.robot.limits),
+            motion_clearance=check.proof.clearance, **certificate(along.proof),
         )  # fmt: skip
 
 
-def _check_steps(steps: Sequence[ArmStep], known: Sequence[ScheduledStep]) -> None:
-    """Check names and order of steps.
+def _check_options(seed: int, options: Mapping[str, Any]) -> None:
+    """Check options of plans.
 
     Raises:
-        ParameterError: No step, a name given twice, a negative time, or steps that wait for each other.
-        UnknownNameError: A step waits for one that there is not.
+        UnknownNameError: There is no such option.
+        ParameterError: The seed is faulty, or motions are not timed from rest.
     """
-    if not steps or not all(isinstance(step, ArmStep) for step in steps):
-        raise ParameterError("steps", steps, "one ArmStep or more")
-    names = [*(step.name for step in known), *(step.name for step in steps)]
-    for name in names:
-        if names.count(name) > 1:
-            raise ParameterError("steps", f"two steps {name!r}", "names that differ")
-    for step in steps:
-        check_number(step.hold, f"steps.{step.name}.hold", 0.0)
-        for other in step.after:
-            check_name(other, f"step in steps.{step.name}.after", names)
-    done = {step.name for step in known}
-    left = {group: [s for s in steps if s.group == group] for group in dict.fromkeys(s.group for s in steps)}
-    while any(left.values()):
-        ready = [some for some in left.values() if some and set(some[0].after) <= done]
-        if not ready:
-            stuck = ", ".join(some[0].name for some in left.values() if some)
-            raise ParameterError("steps", stuck, "steps that do not wait for each other in a circle")
-        for some in ready:
-            done.add(some.pop(0).name)
+    check_options(options, OPTIONS)
+    check_seed(seed)
+    timing = options.get("timing", True)
+    if not timing or (isinstance(timing, Timing) and (timing.start_velocity or timing.start_acceleration)):
+        raise ParameterError("timing", timing, "True or a Timing that starts at rest")
 
 
-def _check_disjoint(joints: Mapping[str, Sequence[str]]) -> None:
-    """Check that no joint is in two groups.
+def _check_goal(planner: MotionPlanner, start: Array, step: ArmStep) -> None:
+    """Check the goal of a step, unless it is an object that draws states.
 
     Raises:
-        ParameterError: One is.
+        ParameterError: It is faulty, or has an approach.
     """
-    owners = dict[str, str]()
-    for group, names in joints.items():
-        for name in names:
-            if owners.setdefault(name, group) != group:
-                raise ParameterError("steps", f"{owners[name]} and {group}", f"groups that do not share {name}")
+    if isinstance(step.goal, GoalSampler):
+        return
+    try:
+        problem = planner.problem(start, step.goal, group=step.group)
+        check_is_no_line(problem)
+        problem.goal_states(planner.robot.joint_names)
+        workspace_goal(planner.robot, problem)
+    except ApexError as error:
+        raise ParameterError(f"steps.{step.name}.goal", step.goal, f"a possible goal ({error})") from None

@@ -12,7 +12,7 @@ from apex_ompl.goals.alignment import AlignmentGoal, within
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import TOLERANCE
 from apex_ompl.goals.pose_goal import PoseGoal
-from apex_ompl.ompl.setup import HELD_WIDTH, workspace_goal
+from apex_ompl.ompl.setup import held_range, workspace_goal
 from apex_ompl.planning.query import Group, planned_joints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
@@ -81,9 +81,7 @@ def task_goal(
     if move.group is not None or group is not None:
         moving = planned_joints(robot, move.group or group or ())
     held = np.array([k for k, name in enumerate(robot.joint_names) if name not in moving], np.intp)
-    lower, upper = robot.limits.lower.copy(), robot.limits.upper.copy()
-    lower[held] = np.maximum(lower[held], start[held] - HELD_WIDTH)
-    upper[held] = np.minimum(upper[held], start[held] + HELD_WIDTH)
+    lower, upper = held_range(robot.limits.lower, robot.limits.upper, start, held)
     narrow = replace(robot, limits=replace(robot.limits, lower=lower, upper=upper)) if len(held) else robot
     states = robot.within_limits(problem.goal_states(robot.joint_names))
     states = states[[(q[held] == start[held]).all() for q in states]] if len(states) else states

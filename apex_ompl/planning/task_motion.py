@@ -11,24 +11,15 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.planning.superposition import superposed
 from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner, timing_in
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import (
-    AttachStep,
-    DetachStep,
-    GraspStep,
-    MotionStep,
-    ReleaseStep,
-    RetreatStep,
-    Step,
-    TogetherStep,
-)
+from apex_ompl.scene.steps import DetachStep, MotionStep, ReleaseStep, RetreatStep, Step, TakingStep, TogetherStep
 from apex_ompl.timing import Timing, Trajectory
+from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.trajectory import ROUNDING, joined
 from apex_ompl.types import Array
 
@@ -199,7 +190,7 @@ def changes(step: Step, world: TaskWorld) -> tuple[tuple[str, ...], tuple[str, .
             released += one.objects or world.held_by(one.hand)
         elif isinstance(one, DetachStep):
             released.append(one.object)
-        elif isinstance(one, GraspStep | AttachStep):
+        elif isinstance(one, TakingStep):
             grasped.append(one.object)
     return tuple(released), tuple(grasped)
 

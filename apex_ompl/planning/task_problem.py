@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from apex_ompl.errors import ParameterError
-from apex_ompl.planning.query import goal_record
+from apex_ompl.planning.query import AnyOf, Group, goal_record, joint_values, planned_joints
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Vector
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
@@ -32,7 +32,7 @@ def steps_of(robot: Robot, steps: Sequence[Step | Mapping[str, Any]]) -> list[An
         if not isinstance(step, Step | Mapping):
             raise ParameterError(f"steps[{k}]", step, "a step such as {'kind': 'move', 'goal': 'home'}")
         if isinstance(step, Mapping) and step.get("kind") == "move" and "goal" in step:
-            found.append({**step, "goal": _goal(robot, step["goal"])})
+            found.append({**step, "goal": _goal(robot, step["goal"], step.get("group"))})
         else:
             found.append(dict(step) if isinstance(step, Mapping) else step)
     return found
@@ -57,10 +57,20 @@ def sequence_problem(robot: Robot, problem: Problem, steps: Sequence[Step | Mapp
     return problem.model_copy(update={"goal": goal, "after": tuple(rest)})
 
 
-def _goal(robot: Robot, goal: Any) -> Any:
-    """Return a goal as a record, or as it is in files."""
+def _goal(robot: Robot, goal: Any, group: Any) -> Any:
+    """Return a goal as a record, or as it is in files; of poses of the robot the joints of a group count, if given."""
     in_files = isinstance(goal, Mapping) and set(goal) & set(Goal.model_fields)
-    return goal if in_files else goal_record(robot, goal, {})
+    return goal if in_files else goal_record(robot, goal if group is None else _of_group(robot, goal, group), {})
+
+
+def _of_group(robot: Robot, goal: Any, group: Group) -> Any:
+    """Return a goal with the values of a group's joints in place of the names of poses."""
+    if isinstance(goal, AnyOf):
+        return AnyOf([_of_group(robot, one, group) for one in goal.goals])
+    if not isinstance(goal, str):
+        return goal
+    values = joint_values(robot, goal, "goal")
+    return {joint: values[joint] for joint in planned_joints(robot, group)}
 
 
 def with_lines(problem: Problem) -> Problem:

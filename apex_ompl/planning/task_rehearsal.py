@@ -18,12 +18,13 @@ from apex_ompl.constraints.line_tracking import LineTracker, Track
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.ompl.setup import state_fault
+from apex_ompl.planning.query import Group
 from apex_ompl.planning.task_goals import TaskGoal, task_goal
 from apex_ompl.planning.task_steps import StepPlanner
 from apex_ompl.planning.task_waypoints import StepFailed
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, HandStep, LineStep, ReleaseStep, RetreatStep, TogetherStep, TurnStep
+from apex_ompl.scene.steps import GraspStep, HandedStep, StraightStep, TogetherStep
 from apex_ompl.types import Array
 
 BREADTH = 4  # goals of a later stage that are tried from one state
@@ -57,15 +58,17 @@ def stages(problem: Problem) -> list[Stage]:
 class Rehearsal:
     """Goes through the steps of one task without planning motions."""
 
-    def __init__(self, planner: StepPlanner, seed: int, stop: Callable[[], bool]) -> None:
+    def __init__(self, planner: StepPlanner, seed: int, stop: Callable[[], bool], group: Group | None = None) -> None:
         """Rehearse the task of a planner of steps.
 
         Args:
             planner: The planner; its checker is used.
             seed: Seed of the descents.
             stop: Whether no time is left.
+            group: Joints that are planned where a motion names none.
         """
         self.planner, self.stages, self.seed, self.stop = planner, stages(planner.problem), seed, stop
+        self._group = group
         self._visits, self._thorough = 0, False
 
     def later_goals(self, k: int, world: TaskWorld, q: Array, thorough: bool = False) -> list[Array]:
@@ -102,7 +105,8 @@ class Rehearsal:
 
     def _goals(self, k: int, world: TaskWorld, q: Array) -> Array:
         """Return a few free states that reach the goal of a stage from a state, shape (N, dof)."""
-        made = task_goal(self.planner.robot, world, self.planner.problem, self.stages[k].move, q)
+        move = self.stages[k].move
+        made = task_goal(self.planner.robot, world, self.planner.problem, move, q, group=self._group)
         self.planner.become(world)
         return reached(self.planner, made, np.random.default_rng([self.seed, k]))
 
@@ -120,10 +124,10 @@ class Rehearsal:
         return world, q
 
     def _step(self, step: AnyStep, world: TaskWorld, q: Array) -> tuple[TaskWorld, Array]:
-        if isinstance(step, LineStep | TurnStep | RetreatStep):
+        if isinstance(step, StraightStep):
             end = self._tracked(step, world, q)
             return world.after(step, end), end
-        if isinstance(step, HandStep | ReleaseStep | GraspStep):
+        if isinstance(step, HandedStep):
             during = world.grasped(step, q) if isinstance(step, GraspStep) else world
             end = self.planner.hand_end(during, step, q)
             self.planner.become(during)
@@ -136,7 +140,7 @@ class Rehearsal:
             return world.after(step, end), end
         return world.after(step, q), q
 
-    def _tracked(self, step: LineStep | TurnStep | RetreatStep, world: TaskWorld, q: Array) -> Array:
+    def _tracked(self, step: StraightStep, world: TaskWorld, q: Array) -> Array:
         """Return the last state of straight lines, shape (dof,)."""
         query = self.planner.line_query(world, step, q, None)
         if are_same(query.poses):

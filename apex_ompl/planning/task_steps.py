@@ -12,32 +12,33 @@ import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.line import SAME_POINT
+from apex_ompl.constraints.line_ends import LineEnd
 from apex_ompl.errors import SceneError, TimingError
 from apex_ompl.goals.grasp import grasp
 from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.path import Path
+from apex_ompl.paths.path import Path, abreast
 from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
-from apex_ompl.planning.superposition import abreast, superposed
 from apex_ompl.planning.task_constraints import StepConstraints
 from apex_ompl.planning.task_waypoints import StepFailed, held_pose, waypoints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
 from apex_ompl.scene.steps import (
-    AllowStep,
-    AttachStep,
+    BodiesStep,
     DetachStep,
     GraspStep,
-    HandStep,
+    HandedStep,
     LineStep,
-    ReleaseStep,
     RetreatStep,
+    StraightStep,
+    TakingStep,
     TogetherStep,
     TurnStep,
     WaitStep,
 )
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.trajectory import ROUNDING
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
@@ -157,7 +158,7 @@ class StepPlanner:
             return self._line(world, step, q, timing)
         if isinstance(step, TogetherStep):
             return self._together(world, step, q, timing)
-        if isinstance(step, AttachStep | DetachStep | AllowStep):
+        if isinstance(step, BodiesStep):
             during = world if isinstance(step, DetachStep) else world.after(step, q)
             return self._proved(StepPlan(step, during, world.after(step, q), Path(q[None]), None, nan), timing)
         assert not isinstance(step, MoveStep)
@@ -167,9 +168,7 @@ class StepPlanner:
         """Put the bodies of a world into the checker, with other pairs that may touch if they are given."""
         self.checker.become(world.scene, world.held, world.pairs if pairs is None else pairs)
 
-    def line_query(
-        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
-    ) -> LineQuery:
+    def line_query(self, world: TaskWorld, step: StraightStep, q: Array, timing: Timing | None) -> LineQuery:
         """Return what a step along straight lines is about; the checker has the bodies of its world then.
 
         Raises:
@@ -182,14 +181,13 @@ class StepPlanner:
             timing=False if timing is None else timing_in(world, timing), problem=lambda goals: self.problem,
         )  # fmt: skip
 
-    def _line(
-        self, world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array, timing: Timing | None
-    ) -> StepPlan:
+    def _line(self, world: TaskWorld, step: StraightStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return straight lines from poses of frames to poses, with blends between them."""
         query = self.line_query(world, step, q, timing)
         found = plan_along(self.checker, query, self._deadline, self._ends)
         if not found or found.path is None:
-            raise StepFailed(found.reason, " ".join((f"{found.end}", *found.blocked_by)))
+            cause = "" if found.end is LineEnd.REACHED else " ".join((f"{found.end}", *found.blocked_by))
+            raise StepFailed(found.reason, cause)
         path = found.path
         if not np.array_equal(path.states[0], q):
             raise StepFailed("the line does not start in the state before it")
@@ -201,16 +199,14 @@ class StepPlanner:
             deviation=0.0 if found.trajectory is None else found.deviation,
         )  # fmt: skip
 
-    def _hand(
-        self, world: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array, timing: Timing | None
-    ) -> StepPlan:
+    def _hand(self, world: TaskWorld, step: HandedStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a hand that opens or closes."""
         during = world.grasped(step, q) if isinstance(step, GraspStep) else world
         end = self.hand_end(during, step, q)
         states = np.stack([q, end]) if (end != q).any() else q[None]
         return self._proved(StepPlan(step, during, world.after(step, end), Path(states), None, nan), timing)
 
-    def hand_end(self, during: TaskWorld, step: HandStep | ReleaseStep | GraspStep, q: Array) -> Array:
+    def hand_end(self, during: TaskWorld, step: HandedStep, q: Array) -> Array:
         """Return the state after a hand has opened or closed, shape (dof,).
 
         Raises:
@@ -248,7 +244,7 @@ class StepPlanner:
             raise StepFailed(f"two of them move {self.robot.joint_names[shared[0]]}")
         during, after, end = world, world, q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
         for one in step.steps:
-            during = during.after(one, q) if isinstance(one, GraspStep | AttachStep) else during
+            during = during.after(one, q) if isinstance(one, TakingStep) else during
             after = after.after(one, end)
         motions = [plan.motion for plan in plans if plan.motion is not None]
         motion = superposed([(one, 0.0) for one in motions]) if len(motions) == len(plans) else None
@@ -260,11 +256,26 @@ class StepPlanner:
         lefts, use = [plan.left for plan in plans if not isnan(plan.left)], dict[str, float]()
         for plan in plans:
             use = {name: max(use.get(name, 0.0), share) for name, share in (use | dict(plan.use)).items()}
+        if motion is not None and timing is not None:
+            use |= self._kept_together(during, timing, motion)
         left = nan if not lefts else max(lefts) if motion is not None else float(len(path.states) - 1)
         return StepPlan(
             step, during, after, path, motion, check.proof.clearance, left, use,
             max(plan.deviation for plan in plans),
         )  # fmt: skip
+
+    def _kept_together(self, world: TaskWorld, timing: Timing, motion: Trajectory) -> dict[str, float]:
+        """Return the shares of limits of torques and tool speeds, where joints of one arm may move in several steps.
+
+        Raises:
+            StepFailed: One is exceeded.
+        """
+        more = timing_in(world, timing).motion_limits(self.robot, tuple(world.held.values()), self.problem.payload)
+        if more is None:
+            return {}
+        if fault := more.fault(motion):
+            raise StepFailed(fault, "limits of torques or tool speeds")
+        return more.use(motion)
 
     def _closed(self, during: TaskWorld, step: GraspStep, q: Array) -> float:
         """Return the synergy at which a hand is just before contact with its object.

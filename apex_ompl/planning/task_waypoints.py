@@ -11,7 +11,7 @@ import pinocchio as pin
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.constraints.frames import frame_of
 from apex_ompl.planning.task_world import TaskWorld
-from apex_ompl.scene.steps import LineStep, RetreatStep, TurnStep
+from apex_ompl.scene.steps import LineStep, RetreatStep, StraightStep, TurnStep
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
 
@@ -33,7 +33,7 @@ class StepFailed(Exception):  # noqa: N818 - an outcome, not an error
         self.cause = cause or reason
 
 
-def waypoints(world: TaskWorld, step: LineStep | TurnStep | RetreatStep, q: Array) -> Sequence[Mapping[str, Array]]:
+def waypoints(world: TaskWorld, step: StraightStep, q: Array) -> Sequence[Mapping[str, Array]]:
     """Return the poses of the frames of a step from a state, shape (dof,), one after the other, shape (4, 4) each.
 
     Raises:

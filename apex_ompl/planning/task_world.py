@@ -16,6 +16,7 @@ from apex_ompl.constraints.frames import LinkFace, frame_of
 from apex_ompl.errors import ApexError, FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.planning.line_query import tools_of
+from apex_ompl.planning.query import planned_joints
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
@@ -23,12 +24,15 @@ from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import (
     AllowStep,
     AttachStep,
+    BodiesStep,
     DetachStep,
     GraspStep,
+    HandedStep,
     HandStep,
     LineStep,
     ReleaseStep,
     RetreatStep,
+    TakingStep,
     TogetherStep,
     TurnStep,
 )
@@ -138,7 +142,7 @@ class TaskWorld:
             for one in step.steps:
                 world = world.after(one, q)
             return world
-        if isinstance(step, GraspStep | AttachStep):
+        if isinstance(step, TakingStep):
             return self.grasped(step, q)
         if isinstance(step, RetreatStep):
             return replace(self, leaving={hand: names for hand, names in self.leaving.items() if hand != step.hand})
@@ -176,7 +180,7 @@ class TaskWorld:
             leaving = {**self.leaving, hand: left} if left else self.leaving
         return replace(self, scene=scene, held=held, allowed=allowed, leaving=leaving)
 
-    def grasped(self, step: GraspStep | AttachStep, q: Array) -> TaskWorld:
+    def grasped(self, step: TakingStep, q: Array) -> TaskWorld:
         """Return the world in which the object of a step is held, taken where it is at a state, shape (dof,)."""
         name, taker = step.object, step.hand if isinstance(step, GraspStep) else step.link
         link = self.robot.hands[taker].palm if taker in self.robot.hands else taker
@@ -220,15 +224,31 @@ def check_steps(robot: Robot, problem: Problem) -> None:
         for name, value, expected in _faults(world, step):
             raise FileFormatError(problem.source, f"after.{k}.{name}", value, expected)
         if isinstance(step, MoveStep):
-            moved = world.problem(problem, step.goal, q)
-            try:
-                workspace_goal(robot, moved)
-                moved.goal_states(robot.joint_names)
-            except ApexError as error:
-                raise FileFormatError(
-                    problem.source, f"after.{k}.goal", str(error), "expected a possible goal"
-                ) from None
+            _check_move(world, problem, step, q, f"after.{k}")
         world = world.after(step, q)
+
+
+def _check_move(world: TaskWorld, problem: Problem, step: MoveStep, q: Array, field: str) -> None:
+    """Check the goal of a motion, and its joints.
+
+    Raises:
+        FileFormatError: One is unknown or faulty; the message names the step.
+    """
+    robot, source = world.robot, problem.source
+    moved = world.problem(problem, step.goal, q)
+    try:
+        workspace_goal(robot, moved)
+        moved.goal_states(robot.joint_names)
+    except FileFormatError as error:
+        raise FileFormatError(source, f"{field}.{error.field}", error.value, error.expected) from None
+    except ApexError as error:
+        expected = f"expected a possible goal ({error})"
+        raise FileFormatError(source, f"{field}.goal", step.title, expected) from None
+    try:
+        planned_joints(robot, step.group or robot.joint_names)
+    except UnknownNameError as error:
+        expected = f"expected names of groups and joints ({error})"
+        raise FileFormatError(source, f"{field}.group", error.name, expected) from None
 
 
 def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]]:
@@ -238,13 +258,13 @@ def _faults(world: TaskWorld, step: AnyStep) -> Iterable[tuple[str, object, str]
     elif isinstance(step, TogetherStep):
         for k, one in enumerate(step.steps):
             yield from ((f"steps.{k}.{name}", value, expected) for name, value, expected in _faults(world, one))
-    elif isinstance(step, AttachStep | DetachStep | AllowStep):
+    elif isinstance(step, BodiesStep):
         yield from _body_faults(world, step)
-    elif isinstance(step, HandStep | ReleaseStep | GraspStep | RetreatStep):
+    elif isinstance(step, HandedStep | RetreatStep):
         yield from _hand_faults(world, step)
 
 
-def _body_faults(world: TaskWorld, step: AttachStep | DetachStep | AllowStep) -> Iterable[tuple[str, object, str]]:
+def _body_faults(world: TaskWorld, step: BodiesStep) -> Iterable[tuple[str, object, str]]:
     if isinstance(step, AttachStep):
         if step.object not in world.scene:
             yield "object", step.object, f"expected an obstacle: {', '.join(world.scene) or 'there is none'}"
@@ -264,9 +284,7 @@ def _body_faults(world: TaskWorld, step: AttachStep | DetachStep | AllowStep) ->
                 yield "pairs", name, f"expected links of the robot, or: {named or 'there is no object'}"
 
 
-def _hand_faults(
-    world: TaskWorld, step: HandStep | ReleaseStep | GraspStep | RetreatStep
-) -> Iterable[tuple[str, object, str]]:
+def _hand_faults(world: TaskWorld, step: HandedStep | RetreatStep) -> Iterable[tuple[str, object, str]]:
     hands = world.robot.hands
     if step.hand not in hands:
         yield "hand", step.hand, f"expected a hand: {', '.join(hands) or 'the robot has none'}"

@@ -11,11 +11,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.ompl.process import Interrupt, quiet_ompl
@@ -39,6 +41,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.forking import unforked
 from apex_ompl.util.process import running
+from apex_ompl.util.validation import check_flag, check_integer
 
 EXAMINATION = 0.5  # of the time, at most, for the search for goals of a motion once one is found
 ROUNDS = 7  # of sampling goals, after those of the set-up
@@ -67,6 +70,15 @@ class TaskSearch:
     goes_back: bool = True
     wanted: int = 3
 
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ParameterError: One is faulty.
+        """
+        check_flag(self.goes_back, "goes_back")
+        check_integer(self.wanted, "wanted", 1)
+
 
 class _Choice(NamedTuple):
     """A goal, and goals of the later motions that were rehearsed from it."""
@@ -92,12 +104,25 @@ def plan_task(
         KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
     """
     options.check()
+    if search is not None and not isinstance(search, TaskSearch):
+        raise ParameterError("search", search, "a TaskSearch")
     check_steps(checker.robot, problem)
     task = TaskPlanner(checker, problem, options, plan_to, search or TaskSearch())
     try:
         return task.plan()
     finally:
-        checker.become(task.world.scene, task.world.held, task.world.pairs)
+        _restore(checker, task.world)
+
+
+def _restore(checker: CollisionChecker, world: TaskWorld) -> None:
+    """Put the bodies of a world into a checker, in their order, on which plans of one seed may depend."""
+    checker.become(world.scene, world.held, world.pairs)
+    if [*checker.obstacles] == [*world.scene] and [*checker.held] == [*world.held]:
+        return
+    pairs = enumerate(zip(checker.obstacles, world.scene, strict=True))
+    first = next((k for k, (one, other) in pairs if one != other), len(world.scene))
+    checker.become(dict(islice(world.scene.items(), first)), {}, ())
+    checker.become(world.scene, world.held, world.pairs)
 
 
 class TaskPlanner:
@@ -123,7 +148,7 @@ class TaskPlanner:
         bodies = self.world.scene.values(), self.world.held.values(), self.world.allowed
         mine = CollisionChecker(checker.robot, *bodies)
         self._steps = StepPlanner(mine, problem, self._deadline, lambda: self._interrupt.pressed)
-        self._rehearsal = Rehearsal(self._steps, options.seed, self._ends)
+        self._rehearsal = Rehearsal(self._steps, options.seed, self._ends, options.group)
         self._stages = self._rehearsal.stages
         self._first: PlanResult | None = None
 

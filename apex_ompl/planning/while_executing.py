@@ -18,12 +18,14 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from time import perf_counter
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.conservative import CheckCounts
 from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.moving import MOST_SPANS
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
@@ -31,13 +33,26 @@ from apex_ompl.moving.given_motion import GivenMotion
 from apex_ompl.moving.motion_optimizer import MotionOptimizer
 from apex_ompl.moving.retime import Blocked, Query, Retimed, retime_around
 from apex_ompl.ompl import setup as ompl_setup
+from apex_ompl.ompl.process import Interrupt, quiet_ompl, seed_ompl
 from apex_ompl.ompl.setup import PlanningSetup, state_fault
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
-from apex_ompl.planning.among_dynamic_obstacles import PATH_STATES, RETIMED, SPACE_TIME, InTime, space_time_motion
+from apex_ompl.planners import AnyPlanner
+from apex_ompl.planning import motions
+from apex_ompl.planning.among_dynamic_obstacles import (
+    PATH_STATES,
+    RETIMED,
+    SPACE_TIME,
+    InTime,
+    space_time_motion,
+    warm_up,
+)
+from apex_ompl.planning.one_motion import parameters_of
+from apex_ompl.planning.options import PlanOptions
 from apex_ompl.planning.query import Group, State, joint_values, planned_joints
 from apex_ompl.planning.step_records import FoundPath, PlanQuery, constraint_fields
-from apex_ompl.planning.steps import finish, prove, solve, time
+from apex_ompl.planning.steps import check, finish, prove, solve, time
+from apex_ompl.planning.world_checkers import WorldCheckers
 from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Goal, Problem
@@ -45,6 +60,8 @@ from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import distinct
 from apex_ompl.util.clocks import Deadline, timed
+from apex_ompl.util.forking import unforked
+from apex_ompl.util.process import running
 
 if TYPE_CHECKING:
     from apex_ompl.constraints.user import UserConstraint
@@ -134,7 +151,9 @@ class WhileExecuting(InTime):
         return MotionOptimizer(kernel, DynamicObstacles(()), self.limits, given=self.given.values)
 
     def accepts(self, motion: Trajectory) -> bool:
-        """Whether the motion of all joints is proved."""
+        """Whether the motion of all joints is proved, and that of the planned ones keeps all limits."""
+        if self.is_over(motion):
+            return False
         both = self.given.combined(motion)
         if not self.checker.are_free(both(np.linspace(0.0, both.duration, SAMPLES))).all():
             return False
@@ -177,13 +196,61 @@ class WhileExecuting(InTime):
         solved_by = f"{still.solved_by}+{method}" if method else still.solved_by
         exact = FoundPath(query, PlanStatus.EXACT_SOLUTION, "", Path(states), solved_by, check.proof)
         return replace(
-            exact.result(), problem=self.problem, trajectory=both, limit_use=both.use(setup.robot.limits),
-            timing_method=method or still.timing_method, motion_clearance=proved.proof.clearance,
+            exact.result(), problem=self.problem, trajectory=both, timing_method=method or still.timing_method,
+            limit_use=self.use(motion) | both.use(setup.robot.limits), motion_clearance=proved.proof.clearance,
             deviation=deviation, **kept,
         )  # fmt: skip
 
 
-def plan_while_executing(
+def plan_beside(
+    checkers: WorldCheckers, problem: Problem, asked: Asked, planner: AnyPlanner | None,
+    options: PlanOptions, *, model: str | None, started: float,
+) -> PlanResult:  # fmt: skip
+    """Plan some joints while others execute a motion, in the world as it is now.
+
+    Args:
+        checkers: The checkers of the world, whose lock is held.
+        problem: The problem where the given motion has ended.
+        asked: The given motion, and the joints that are planned.
+        planner: A planner; apex by default.
+        options: The options.
+        model: Name or folder of the checkpoint that ``apex`` uses; by default its own.
+        started: Value of ``time.perf_counter`` when the call started [s].
+
+    Raises:
+        ApexError: The planner, a parameter or an option is faulty.
+        KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
+    """
+    options.check()
+    if not options.timing or options.leave_contact:
+        wanted = "True or a Timing, and no contact to leave, with while_executing"
+        raise ParameterError("timing", options.timing, wanted)
+    timing = Timing() if options.timing is True else options.timing
+    parameters = parameters_of(planner, model, options)
+    with quiet_ompl(), Interrupt() as interrupt, running(interrupt.end):
+        with unforked():
+            checker = checkers.now()
+            checker.check_counts = CheckCounts()
+            motions.warm_up(checker)
+            warm_up(checker)
+            seed_ompl(options.seed)
+
+        def query_of(setup: PlanningSetup) -> PlanQuery:
+            query = check(
+                setup, parameters, timeout=options.timeout, objective=options.objective,
+                calm_factor=options.calm_factor, started=started, notes=setup.notes,
+                times={"setup": perf_counter() - started},
+            )  # fmt: skip
+            query.interrupt = interrupt
+            return query
+
+        return _plan_beside(
+            query_of, problem, checker, asked, simplify=options.simplify, timing=timing, seed=options.seed,
+            constraints=options.constraints,
+        )  # fmt: skip
+
+
+def _plan_beside(
     query_of: Callable[[PlanningSetup], PlanQuery], problem: Problem, checker: CollisionChecker, asked: Asked, *,
     simplify: bool, timing: Timing, seed: int = 0, constraints: Sequence[Constraint | UserConstraint] = (),
 ) -> PlanResult:  # fmt: skip
@@ -322,7 +389,7 @@ def moved_links(robot: Robot, columns: tuple[int, ...]) -> frozenset[str]:
     for q in states:
         pin.framesForwardKinematics(robot.model, data, robot.to_pinocchio(q))
         places.append(np.array([data.oMf[k].homogeneous for k in numbers.values()]))
-    moves = np.abs(np.array(places[:-1]) - places[-1]).max(axis=(0, 2, 3), initial=0.0) > SAME_PLACE
+    moves = np.abs(np.array(places) - places[-1]).max(axis=(0, 2, 3), initial=0.0) > SAME_PLACE
     return frozenset(link for link, one in zip(numbers, moves.tolist(), strict=True) if one)
 
 

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import os
-import shutil
-import tempfile
-import weakref
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
@@ -17,16 +12,17 @@ from numpy.typing import ArrayLike
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.shapes import coal_geometry, with_file_read, with_file_unread
-from apex_ompl.errors import FileFormatError, ParameterError, SceneError
+from apex_ompl.errors import FileFormatError, SceneError
+from apex_ompl.planning.cloud_files import CloudFiles, cloud_of
+from apex_ompl.planning.query import State, check_problem, state_array
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
-from apex_ompl.util.files import path_text, write_atomically
 from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import validate
-from apex_ompl.util.validation import finite_array
+from apex_ompl.util.validation import check_flag
 
 if TYPE_CHECKING:
     from apex_ompl.scene.bodies import (
@@ -40,8 +36,6 @@ if TYPE_CHECKING:
         Sphere,
         VoxelFile,
     )
-
-KEPT_CLOUDS = 8  # temporary files that no obstacle has any more
 
 
 class ObstacleFields(TypedDict, total=False):
@@ -233,7 +227,7 @@ class World:
 
     def attach(
         self, held: AttachedObject | Mapping[str, Any] | str, link: str | None = None,
-        touch_links: Sequence[str] | None = None, *, links: Sequence[str] | None = None, at: ArrayLike | None = None,
+        touch_links: Sequence[str] | None = None, *, links: Sequence[str] | None = None, at: State | None = None,
     ) -> None:  # fmt: skip
         """Attach an object to a link; it then collides like a part of the robot.
 
@@ -244,27 +238,28 @@ class World:
             touch_links: Links that it may touch; by default those of the hand.
             links: Two links that hold it together, in place of ``link``: the second keeps its pose in the first along
                 every path.
-            at: State at which it is taken, shape (dof,); must be given for an obstacle. The object must not overlap
-                anything there.
+            at: State at which it is taken; must be given for an obstacle. The object must not overlap anything there.
 
         Raises:
             SceneError: The name is taken, there is no such obstacle, or the object overlaps something.
             UnknownNameError: An unknown link.
             FileFormatError: A field is unknown or faulty.
+            ParameterError: ``at`` has not the robot's joints.
         """
+        q = None if at is None else state_array(self.checker.robot, at, "at")
         with self.lock:
             taken = None
             if links is not None:
-                if link is not None:
-                    raise SceneError("give either one link or links, not both")
+                if link is not None or isinstance(links, str):
+                    raise SceneError("give either one link or links, a list of two, not both")
                 link = next(iter(links), None)
             if isinstance(held, str):
-                if link is None or at is None:
+                if link is None or q is None:
                     raise SceneError(
                         f"to attach the obstacle {held!r}, give the link and the state at which it is taken"
                     )
                 taken = self.checker.obstacle(held)
-                held = self._as_held(taken, link, finite_array(at, "at"))
+                held = self._as_held(taken, link, q)
             wanted = self._read(AttachedObject, held, "held object")
             wanted = with_file_unread(wanted) if taken is None else wanted
             changes = {"link": link, "links": links, "touch_links": touch_links}
@@ -276,8 +271,8 @@ class World:
                 self.checker.remove(taken.name)
             try:
                 self.checker.attach(wanted)
-                if at is not None:
-                    self._check_grasp(wanted.name, finite_array(at, "at"))
+                if q is not None:
+                    self._check_grasp(wanted.name, q)
             except Exception:
                 if wanted.name in self.held and (taken is not None or self.held[wanted.name] is wanted):
                     self.checker.detach(wanted.name)
@@ -287,16 +282,18 @@ class World:
                     self.checker.allow(*pair)
                 raise
 
-    def detach(self, name: str, *, at: ArrayLike | None = None) -> None:
-        """Remove a held object; with a state ``at``, shape (dof,), it stays in the world where it is then.
+    def detach(self, name: str, *, at: State | None = None) -> None:
+        """Remove a held object; with a state ``at`` it stays in the world where it is then.
 
         Raises:
             SceneError: There is no such held object.
+            ParameterError: The state has not the robot's joints.
         """
+        q = None if at is None else state_array(self.checker.robot, at, "at")
         with self.lock:
             held, left = self.held.get(name) if isinstance(name, str) else None, list[Obstacle]()
-            if at is not None and held is not None:
-                pose = self.checker.robot.link_pose(finite_array(at, "at"), held.link) @ held.pose
+            if q is not None and held is not None:
+                pose = self.checker.robot.link_pose(q, held.link) @ held.pose
                 shape = given_fields(held, ("link", "links", "touch_links"))
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
             self.checker.detach(name)
@@ -319,8 +316,10 @@ class World:
 
         Raises:
             UnknownNameError: There is no such body.
+            ParameterError: ``allowed`` is no truth value.
             SceneError: Both names are of the same body.
         """
+        check_flag(allowed, "allowed")
         with self.lock:
             self.checker.allow(first, second, allowed)
 
@@ -338,8 +337,10 @@ class World:
         """Replace all obstacles, held objects and allowed pairs by those of a problem.
 
         Raises:
+            ParameterError: It is no problem.
             ApexError: A body of the problem is faulty; the world is then empty.
         """
+        check_problem(problem)
         with self.lock:
             self.clear()
             try:
@@ -374,73 +375,3 @@ class World:
     def _read(kind: Any, given: Any, role: str) -> Any:
         plain = dict(given) if isinstance(given, Mapping) else given
         return given if isinstance(given, kind) else validate(kind, plain, role)
-
-
-class CloudFiles:
-    """A folder for the last clouds of a world; it is made when it is needed, and removed with this object.
-
-    It belongs to the process that made it: one that was forked from there makes a folder of its own.
-    """
-
-    def __init__(self) -> None:
-        """Make no folder yet."""
-        self._folder: Path | None = None
-        self._process = 0  # that made the folder
-        self._files: list[Path] = []
-        self._count = 0
-
-    def path(self, file: str | os.PathLike[str] | None) -> Path:
-        """Return the path of a file that is named, or of the next temporary one.
-
-        Raises:
-            ParameterError: The file is no ``.npy``.
-        """
-        if file is not None:
-            given = Path(path_text(file, "file"))
-            if given.suffix != ".npy":
-                raise ParameterError("file", str(file), "a file name ending in .npy")
-            return given
-        if self._folder is None or self._process != os.getpid():
-            self._folder, self._process, self._files = Path(tempfile.mkdtemp(prefix="apex_ompl-")), os.getpid(), []
-            weakref.finalize(self, _remove, self._folder, self._process)
-        self._count += 1
-        return self._folder / f"cloud-{self._count}.npy"
-
-    def write(self, cloud: Array, path: Path, used: Container[str]) -> None:
-        """Write points, shape (N, 3) [m], to one of the paths that :meth:`path` returns.
-
-        Args:
-            cloud: The points.
-            path: Where to.
-            used: Files that obstacles have, which are kept.
-
-        Raises:
-            MissingFileError: The file cannot be written.
-        """
-        content = io.BytesIO()
-        np.save(content, cloud.astype(np.float32))
-        write_atomically(path, content.getvalue())
-        if path.parent == self._folder and self._process == os.getpid():
-            self._files.append(path)
-        free = [one for one in self._files if str(one) not in used and one != path]
-        for one in free[:-KEPT_CLOUDS] if self._process == os.getpid() else ():
-            self._files.remove(one)
-            one.unlink(missing_ok=True)
-
-
-def _remove(folder: Path, process: int) -> None:
-    """Remove a folder in the process that made it."""
-    if os.getpid() == process:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def cloud_of(points: ArrayLike) -> Array:
-    """Return points as an array of shape (N, 3) [m].
-
-    Raises:
-        ParameterError: They have another shape, or are not finite.
-    """
-    cloud = finite_array(points, "points")
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise ParameterError("points", cloud.shape, "an array of shape (N, 3)")
-    return cloud

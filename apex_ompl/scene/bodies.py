@@ -41,6 +41,12 @@ def _non_zero(v: tuple[float, float, float]) -> tuple[float, float, float]:
     return v
 
 
+def _two_bodies(pair: tuple[str, str]) -> tuple[str, str]:
+    if pair[0] == pair[1]:
+        raise ValueError(f"the body {pair[0]!r} is not checked against itself, expected two bodies")
+    return pair
+
+
 Coordinate = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Time = Annotated[float, Field(ge=0.0)]
 Size = Annotated[float, Field(gt=0.0, le=LARGEST)]
@@ -49,6 +55,7 @@ Vector = tuple[Coordinate, Coordinate, Coordinate]
 Direction = Annotated[Vector, AfterValidator(_non_zero)]
 Quaternion = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
 PlaceInTime = tuple[Time, Coordinate, Coordinate, Coordinate]
+BodyPair = Annotated[tuple[str, str], AfterValidator(_two_bodies)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
 
 

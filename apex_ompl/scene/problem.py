@@ -26,7 +26,17 @@ from pydantic import (
 )
 
 from apex_ompl.errors import FileFormatError, ParameterError, nearest_name
-from apex_ompl.scene.bodies import AttachedObject, Mass, Name, Obstacle, Quaternion, Vector, located, pose_matrix
+from apex_ompl.scene.bodies import (
+    AttachedObject,
+    BodyPair,
+    Mass,
+    Name,
+    Obstacle,
+    Quaternion,
+    Vector,
+    located,
+    pose_matrix,
+)
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
 from apex_ompl.scene.steps import AllowStep, MotionStep, Names, SimultaneousStep, TogetherStep
 from apex_ompl.types import Array
@@ -140,7 +150,7 @@ class PoseTarget(StrictModel):
         orientation: Orientation of the frame, a quaternion xyzw; any by default. Of a contact face its z axis counts.
         tolerance: How far from it counts as reached.
         free_turn: Axis of the frame about which it may be turned.
-        turn: Least and largest angle by which it may be turned about that axis [rad]; by default any.
+        turn: Least and largest angle by which it may be turned about that axis, as 2.6 and 3.6 [rad]; by default any.
         lower: Least position of the frame's origin relative to ``position``, along the axes of the wanted pose [m].
         upper: Largest one.
         approach: Displacement along the frame's own axes by which it goes to the pose, straight, without turning [m].
@@ -160,8 +170,10 @@ class PoseTarget(StrictModel):
     def _a_region(self) -> Self:
         if self.free_turn is not None and self.orientation is None:
             raise ValueError("expected an orientation beside free_turn")
-        if self.turn is not None and (self.free_turn is None or not -np.pi <= self.turn[0] <= self.turn[1] <= np.pi):
-            raise ValueError("expected turn: [least, largest] inside [-3.1416, 3.1416] beside a free_turn")
+        if self.turn is not None and (self.free_turn is None or not _is_turn(*self.turn)):
+            raise ValueError(
+                "expected turn: [least, largest] inside [-6.2832, 6.2832], at most 6.2832 apart, beside a free_turn"
+            )
         if not all(low <= 0.0 <= high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError("expected a lower of 0 or less and an upper of 0 or more")
         if self.approach is not None and (self.orientation is None or max(map(abs, self.approach)) < 1e-6):
@@ -186,6 +198,12 @@ class PoseTarget(StrictModel):
     def is_exact(self) -> bool:
         """Whether it is one pose but for a free turn, and no region of positions or angles."""
         return self.turn is None and not any(self.lower) and not any(self.upper)
+
+
+def _is_turn(least: float, largest: float) -> bool:
+    """Whether two angles are a range of at most a whole turn."""
+    whole = 2.0 * np.pi
+    return -whole <= least <= largest <= min(whole, least + whole)
 
 
 class GraspGoal(StrictModel):
@@ -340,7 +358,7 @@ class Problem(StrictModel):
     scene: tuple[Obstacle, ...] = ()
     attached: tuple[AttachedObject, ...] = ()
     payload: dict[Name, Mass] = {}
-    allowed: tuple[tuple[str, str], ...] = ()
+    allowed: tuple[BodyPair, ...] = ()
     start: JointValues
     goal: Goal
     constraints: tuple[AnyConstraint, ...] = ()

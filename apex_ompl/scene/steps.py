@@ -18,7 +18,7 @@ from pydantic import (
     model_validator,
 )
 
-from apex_ompl.scene.bodies import Coordinate, Direction, Name, Size
+from apex_ompl.scene.bodies import BodyPair, Coordinate, Direction, Name, Size
 from apex_ompl.util.schema import StrictModel
 
 LONGEST_WAIT = 3600.0  # [s]
@@ -301,7 +301,7 @@ class AllowStep(Step):
     """
 
     kind: Literal["allow"] = "allow"
-    pairs: Annotated[tuple[tuple[Name, Name], ...], Field(min_length=1)]
+    pairs: Annotated[tuple[BodyPair, ...], Field(min_length=1)]
     contact: bool = True
 
     @property
@@ -311,6 +311,14 @@ class AllowStep(Step):
         return pairs if self.contact else f"{pairs} no longer"
 
 
+StraightStep = LineStep | TurnStep | RetreatStep
+"""A step along which frames go straight, or turn."""
+HandedStep = HandStep | ReleaseStep | GraspStep
+"""A step in which a hand opens or closes."""
+TakingStep = GraspStep | AttachStep
+"""A step after which an object is held."""
+BodiesStep = AttachStep | DetachStep | AllowStep
+"""A step in which bodies change and nothing moves."""
 SimultaneousStep = (
     LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep | AttachStep | DetachStep
 )

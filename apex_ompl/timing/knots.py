@@ -17,6 +17,7 @@ import numpy as np
 from apex_ompl.types import Array, Flags
 
 NANOSECONDS = 1e9  # in a second
+SAME_KNOT = 1e-9  # knots that are nearer to each other than this are one [s]
 SAME_TIME = 1e-4  # largest distance of a time from whole nanoseconds, by rounding [ns]
 SAME_COUNT = 1e-6  # part of a span that counts as none
 LEAST_SPANS = 4  # of a window
@@ -34,6 +35,18 @@ def is_on_grid(times: Array) -> bool:
     """Whether times [s] are whole nanoseconds, except for the rounding of floats."""
     ticks = times * NANOSECONDS
     return bool(np.abs(ticks - np.round(ticks)).max(initial=0.0) <= SAME_TIME)
+
+
+def union(*times: Array) -> Array:
+    """Return the knots of several motions in order, those that are nearly the same once, shape (K,) [s].
+
+    The last one is kept as it is, so that the motion that ends last still ends in its last state.
+    """
+    found = np.sort(np.concatenate(times))
+    kept: Array = found[np.append(True, np.diff(found) > SAME_KNOT)]
+    if len(kept) > 1:
+        kept[-1] = found[-1]
+    return kept
 
 
 def spaced(times: Array, spacing: float) -> Array:

@@ -55,7 +55,7 @@ LIMIT_TOLERANCE = 1e-9  # that a path may be outside the position limits, by rou
 LIMITS = ("velocity", "acceleration", "jerk")
 RANGES = {
     **{f"{limit}_scale": (1e-3, 1.0) for limit in (*LIMITS, "torque")},
-    "deviation": (1e-3, 10.0), "minimum_duration": (0.0, 3600.0),
+    "deviation": (1e-3, 10.0), "minimum_duration": (0.0, spline_method.LONGEST),
 }  # fmt: skip
 
 

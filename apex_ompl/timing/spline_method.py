@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.errors import TimingError
 from apex_ompl.kernel.timing import arc_lengths, curve_duration, max_distance, max_path_speeds
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.curve import Curve, Polyline, deviation_bound
@@ -23,6 +24,8 @@ KNOT_SPACINGS = tuple(k * 2**n / 240 for n in range(11) for k in (1, 1.5))  # in
 FIRST_SPACING = 4  # index of the knot spacing that is tried first; smaller ones where they keep the deviation
 SAME_DURATION = 1.0005  # ratio of durations below which the motion with fewer knots is preferred
 NANOSECOND = 1e-9
+LONGEST = 3600.0
+"""Longest motion that is timed [s]."""
 
 
 class Blend(NamedTuple):
@@ -75,6 +78,9 @@ def blend(
 
     Returns:
         The motion, or None where none keeps ``deviation``, or when ``stop`` returned True.
+
+    Raises:
+        TimingError: It would take longer than ``LONGEST``.
     """
     if line.length > MAX_SPANS * CONTROL_POINT_SPACING * deviation:
         return None
@@ -94,6 +100,8 @@ def blend(
             acceleration = np.minimum(limits.acceleration, limits.jerk * spacing)
             squared_speeds = max_path_speeds(first, second, limits.velocity, acceleration, step, rows)
             duration = curve_duration(squared_speeds, step)
+            if duration > LONGEST:
+                raise TimingError(f"it would take {duration:.6g} s, more than {LONGEST:g} s")
             count = max(1, int(duration / spacing))
             arc = arc_lengths(squared_speeds, step, duration / count, count + 1)
             arc[-1] = line.length

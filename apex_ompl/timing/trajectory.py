@@ -17,7 +17,7 @@ from apex_ompl.kernel.moving import LimitArrays, stop_joints, stop_on_path
 from apex_ompl.kernel.timing import relative_gap, sample_motion
 from apex_ompl.robot.model import Limits
 from apex_ompl.timing.files import NANOSECONDS, STATES, SUFFIXES, decode, encode
-from apex_ompl.timing.knots import LEAST_SPANS, even_times, is_on_grid, refitted, spaced
+from apex_ompl.timing.knots import LEAST_SPANS, even_times, is_on_grid, refitted, spaced, union
 from apex_ompl.timing.samples import Extremes, Sample
 from apex_ompl.timing.smoothness import PULSE_SHARE, Smoothness, spectral_arc_length
 from apex_ompl.types import Array
@@ -341,8 +341,7 @@ class Trajectory:
         """
         if self.joint_names != other.joint_names:
             raise ParameterError("other", ", ".join(other.joint_names), f"the joints {', '.join(self.joint_names)}")
-        times = np.sort(np.concatenate([self.times, other.times]))
-        times = times[np.append(True, np.diff(times) > 1.0 / NANOSECONDS)]
+        times = union(self.times, other.times)
         low, high, *_ = Extremes.of(times, *(self.states(times) - other.states(times)))
         return float(np.maximum(-low, high).max())
 

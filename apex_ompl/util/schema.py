@@ -19,7 +19,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from apex_ompl.errors import FileFormatError, nearest_name
 from apex_ompl.util.arrays import is_masked_array
-from apex_ompl.util.display import values_line
+from apex_ompl.util.display import counted, values_line
 from apex_ompl.util.files import read_text
 from apex_ompl.util.forking import ProcessLock, unforked
 
@@ -390,6 +390,14 @@ def _first_fault(model: type[BaseModel], source: str) -> Iterator[None]:
             expected, value = f"expected one of {first['ctx']['expected_tags']}", first["ctx"]["tag"]
         elif first["type"] == "value_error":
             expected = str(first["ctx"]["error"])
+        elif first["type"] in ("too_short", "too_long"):
+            most = first["type"] == "too_long"
+            number = first["ctx"]["max_length" if most else "min_length"]
+            expected = f"expected {counted(number, 'item')} or {'fewer' if most else 'more'}"
+        elif first["type"] == "tuple_type":
+            expected = "expected a list"
+        elif first["type"] in ("dict_type", "model_type", "model_attributes_type"):
+            expected = "expected a mapping of keys to values"
         elif first["type"] == "bool_type":
             expected = "expected true or false"
         elif first["type"] == "frozen_instance":

@@ -166,7 +166,7 @@ def _is_masked(given: object) -> bool:
 
 
 def _is_real(value: object) -> bool:
-    return not isinstance(value, (str, bytes, bool, np.bool_, complex, np.complexfloating))
+    return value is not None and not isinstance(value, (str, bytes, bool, np.bool_, complex, np.complexfloating))
 
 
 def finite_array(given: ArrayLike, name: str) -> Array:

@@ -25,6 +25,7 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 from apex_ompl.util.extras import import_extra
 from apex_ompl.util.files import check_writable, write_atomically
+from apex_ompl.util.validation import check_number
 from apex_ompl.viz.appearance import (
     BACKGROUND,
     EDGE,
@@ -175,13 +176,14 @@ def render(
         azimuth: Direction of the camera from the front of the robot, counter-clockwise [degrees].
 
     Raises:
-        ParameterError: Another suffix, or a film of a source without a path.
+        ParameterError: Another suffix, a film of a source without a path, or a direction that is no number.
         MissingFileError: The folder cannot be written, or the ``viz`` extra is not installed.
     """
     out = Path(out)
     if out.suffix not in PICTURES + FILMS:
         raise ParameterError("output", str(out), f"a file name ending in {', '.join(PICTURES + FILMS)}")
     check_writable(out)
+    check_number(azimuth, "azimuth")
     if isinstance(source, Problem):
         content = _problem_picture(source, out, size, azimuth)
     elif isinstance(source, PlanResult) and (source.path is None or source.problem is None):

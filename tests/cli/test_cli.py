@@ -15,6 +15,7 @@ import pytest
 import yaml
 from support import ROOT
 
+from apex_ompl.cli.parser import main
 from apex_ompl.scene.problem import Problem
 
 # Around the left shoulder: in collision with the arm at every state.
@@ -84,6 +85,25 @@ def test_check_says_what_is_free_and_what_touches(apex_cli, tmp_path: Path) -> N
     (tmp_path / "bad.yaml").write_text(yaml.safe_dump(data))
     bad = apex_cli("check", tmp_path / "bad.yaml")
     assert bad.returncode == 3 and "mm deep" in bad.stdout and "<-> blob" in bad.stdout
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"payload": {"nohand": 1.0}}, "unknown payload 'nohand'"),
+        ({"after": [{"kind": "wait", "seconds": 1.0}, {"kind": "detach", "object": "cup"}]}, "after.1.object: "),
+        ({"after": [{"kind": "move", "goal": {"any_of": [
+            {"poses": [{"frame": "left_hand", "position": [0.5, 0.2, 0.4], "orientation": [1, 0, 0, 0],
+                        "approach": [0, 0, by]}]} for by in (0.1, 0.2)]}}]}, "approach: expected the same frames"),
+    ],
+    ids=["payload", "step", "approaches"],
+)  # fmt: skip
+def test_check_prints_nothing_of_a_faulty_problem(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fields: dict[str, object], words: str
+) -> None:
+    assert main(["check", str(edited(tmp_path, **fields))]) == 2
+    told = capsys.readouterr()
+    assert not told.out and words in told.err and one_sentence(told.err)
 
 
 def edited(tmp_path: Path, **changes: object) -> Path:

@@ -22,7 +22,7 @@ from apex_ompl.collision.cloud_contact import signed_distances, touches
 from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.shapes import PointCloud, cloud_geometry, is_shell, is_surface, mesh_geometry
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError, ParameterError, SceneError
-from apex_ompl.planning.world import CloudFiles
+from apex_ompl.planning.cloud_files import CloudFiles
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
 from apex_ompl.scene.meshes import triangles, winding_number

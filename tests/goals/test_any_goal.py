@@ -176,6 +176,28 @@ def test_a_region_near_the_start_needs_a_shorter_motion_than_its_middle(robot: R
     assert one and region and region.trajectory.duration < one.trajectory.duration
 
 
+@pytest.mark.parametrize(
+    ("turn", "by", "error"),
+    [
+        ((3.0, np.pi), np.pi + 0.01, 0.01), ((3.0, np.pi), -np.pi, 0.0), ((-np.pi, -3.0), np.pi - 0.01, 0.01),
+        ((2.6, 3.6), -2.9, 0.0), ((2.6, 3.6), -2.4, 2.0 * np.pi - 6.0), ((2.6, 3.6), 2.5, 0.1),
+        ((-3.6, -2.6), 3.0, 0.0), ((5.0, 6.0), -1.0, 0.0), ((-np.pi, np.pi), 3.0, 0.0), ((0.0, 2.0 * np.pi), -1.0, 0.0),
+        ((np.pi, np.pi), -np.pi + 0.002, 0.002), ((-0.2, 0.2), np.pi, np.pi - 0.2),
+    ],
+)  # fmt: skip
+def test_ranges_of_angles_go_on_beyond_half_a_turn(
+    robot: Robot, turn: tuple[float, float], by: float, error: float
+) -> None:
+    wanted = hand_pose(robot, robot.home) * pin.SE3(pin.exp3(np.array([0.0, 0.0, -by])), np.zeros(3))
+    goal = PoseGoal(robot, [target(wanted, free_turn="z", turn=turn)], (), robot.home)
+    assert goal.errors(robot.home)["angle of left_hand"] == pytest.approx(error, abs=1e-6)
+    first = pose_goals(robot, goal.poses, (), robot.home)[0]  # of the nearest pose to the start
+    (drawn,) = first._drawn
+    there = target(hand_pose(robot, robot.home))
+    off = Rotation.from_quat(drawn.orientation).inv() * Rotation.from_quat(there.orientation)
+    assert off.magnitude() == pytest.approx(error, abs=1e-6)
+
+
 def test_goals_that_all_fail_say_so_in_a_sentence(robot: Robot) -> None:
     far = [PoseTarget(frame="left_hand", position=(3.0 + k, 0.0, 0.5)) for k in range(3)]
     with MotionPlanner(robot) as planner:
@@ -209,6 +231,8 @@ def test_faulty_goals_are_named(robot: Robot, goal: Any, message: str) -> None:
         ({"free_turn": "z"}, "an orientation beside free_turn"),
         ({"turn": (0.0, 1.0)}, "beside a free_turn"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (1.0, 0.0)}, "least, largest"),
+        ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (-3.2, 3.2)}, "at most 6.2832 apart"),
+        ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (6.0, 6.3)}, "inside .-6.2832, 6.2832"),
         ({"lower": (0.1, 0.0, 0.0)}, "a lower of 0 or less"),
         ({"approach": (0.0, 0.0, 0.1)}, "beside an orientation"),
         ({"orientation": (0, 0, 0, 1), "approach": (0.0, 0.0, 0.0)}, "an approach that is not zero"),

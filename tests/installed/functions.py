@@ -97,7 +97,7 @@ def _use_planner() -> None:
     """A kept planner, its world, and plans."""
     import apex_ompl
     from apex_ompl.planning.options import check_arguments
-    from apex_ompl.planning.planner import kept_planner
+    from apex_ompl.planning.pool import kept_planner
     from apex_ompl.scene import OnPlane
 
     robot = apex_ompl.load_robot("dual_panda_softhand")

@@ -7,10 +7,16 @@ import pytest
 import ruckig
 from timings import LIMITS, NAMES
 
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
+from apex_ompl.moving import DynamicObstacles
+from apex_ompl.moving.retime import retime
 from apex_ompl.moving.stopping import stop, stop_along
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import Limits
+from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.timing import Timing, Trajectory, time_path
+from apex_ompl.timing.combination import rest
 from apex_ompl.timing.trajectory import STOP_DEVIATION
 
 WIDE = 100.0  # rad, by which position limits are moved out of the way
@@ -166,3 +172,22 @@ def test_a_stop_along_a_motion_that_has_ended_is_rest() -> None:
     motion = time_path(np.array([[0.0, 0.0, 0.0], [1.0, 0.5, 0.0]]), LIMITS, NAMES).trajectory
     found = stop_along(motion, motion.duration, LIMITS)
     np.testing.assert_array_equal(found.trajectory(1.0), motion.positions[-1])
+
+
+def test_faulty_arguments_of_stops_and_obstacles_are_named(robot: Robot) -> None:
+    limits, names, still = robot.limits, robot.joint_names, np.zeros(robot.dof)
+    motion = rest(robot.home, 1.0, names)
+    ball = Obstacle(name="ball", sphere={"radius": 0.1}, position=(0.5, 0.0, 0.5))
+    kernel = CollisionChecker(robot).kernel
+    for call, words in (
+        (lambda: stop(limits, names, robot.home[:3], still, still), "position: expected finite numbers of shape"),
+        (lambda: stop(limits, names, robot.home, still[:3], still), "velocity: expected finite numbers of shape"),
+        (lambda: stop(limits, names, robot.home, still, still * np.nan), "acceleration: expected finite numbers"),
+        (lambda: stop_along(motion, "x", limits), "time: expected a number, got 'x'"),
+        (lambda: retime(kernel, DynamicObstacles([]), motion, limits, hold=-1.0), "hold: expected a number, 0 or more"),
+        (lambda: DynamicObstacles(ball), "obstacles: expected a list of obstacles"),
+        (lambda: DynamicObstacles(["ball"]), "obstacles: expected a list of obstacles"),
+        (lambda: DynamicObstacles(None), "obstacles: expected a list of obstacles, got None"),
+    ):
+        with pytest.raises(ParameterError, match=words):
+            call()  # type: ignore[no-untyped-call]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apex_ompl import MotionPlanner, plan
+from apex_ompl import MotionPlanner, PoseTarget, plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.evaluation import Row, bench
@@ -171,3 +171,24 @@ def test_the_benchmark_runs_levels_with_moving_obstacles(tmp_path: Path) -> None
     out = tmp_path / "runs"
     bench(["vertical/moving-medium-0.2"], [Row("rrtconnect", "rrtconnect")], runs=1, timeout=20.0, out=out)
     assert "vertical/moving-medium-0.2" in "".join(p.read_text() for p in out.rglob("*.json*"))
+
+
+@pytest.mark.parametrize("stage", ["retiming", "space-time"])
+def test_motions_in_time_keep_the_limits_of_torques_and_tools(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    known = among_dynamic_obstacles.plan_among_dynamic_obstacles
+    monkeypatch.setattr(
+        among_dynamic_obstacles, "plan_among_dynamic_obstacles", lambda *given: known(*given, stages=(stage,))
+    )
+    for timing in (Timing(max_tool_speed=1.0), Timing(torque_scale=0.45)):
+        with MotionPlanner(robot) as planner:
+            goal = planner.ik(PoseTarget(frame="left_hand", position=(0.5, 0.0, 0.45)), near="home", count=1)[0].state
+            planner.world.add(
+                name="ball", sphere={"radius": 0.08}, position=(0.45, 0.35, 0.6), velocity=(0.0, -0.3, 0.0)
+            )
+            result = planner.plan("home", goal, timing=timing, timeout=20.0)
+        assert result and result.trajectory is not None and result.solved_by.endswith(stage)
+        limits = timing.motion_limits(robot)
+        assert limits is not None and max(limits.use(result.trajectory).values()) <= 1.0
+        assert limits.use(result.trajectory).items() <= result.limit_use.items()

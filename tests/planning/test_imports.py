@@ -95,8 +95,8 @@ def test_packages_cost_nothing_before_a_name_of_theirs_is_used(package: str) -> 
 
 def test_the_planner_says_what_its_types_are() -> None:
     """Its methods name types of modules that are imported later."""
-    from apex_ompl.planning import planner
+    from apex_ompl.planning import planner, pool
 
-    assert apex_ompl.MotionPlanner is planner.MotionPlanner and callable(planner.kept_planner)
+    assert apex_ompl.MotionPlanner is planner.MotionPlanner and callable(pool.kept_planner)
     _, get, _ = lazy_names("apex_ompl.planning", {"world": "World"})
     assert get("World").__module__ == "apex_ompl.planning.world"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -14,17 +15,23 @@ import pytest
 from planning import cached_problem
 from tasks import contacts, poses
 
-from apex_ompl import ApexError, MotionPlanner, PoseTarget, TaskResult, load_robot, plan_task
+from apex_ompl import AnyOf, ApexError, MotionPlanner, PlanStatus, PoseTarget, TaskResult, load_robot, plan_task
 from apex_ompl.cli.parser import main
 from apex_ompl.goals.grasp_goal import MOST, pose_alternatives
+from apex_ompl.paths.path import abreast
 from apex_ompl.planning import TaskSearch
-from apex_ompl.planning.superposition import abreast, superposed
+from apex_ompl.planning.task_problem import sequence_problem
+from apex_ompl.planning.task_rehearsal import Rehearsal
 from apex_ompl.planning.task_result import load_result
+from apex_ompl.planning.task_steps import StepPlanner
+from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.problems import cells
 from apex_ompl.scene import Goal, Problem
 from apex_ompl.timing import Trajectory, time_path
+from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.rests import is_at_rest
 from apex_ompl.types import Array
+from apex_ompl.util.clocks import Deadline
 
 SECONDS = 60.0
 READY = ("pick_and_place", "pick_and_hand_over", "stack_three_boxes")
@@ -123,6 +130,22 @@ def shelved(planner: MotionPlanner) -> list[dict[str, Any]]:
     ]
 
 
+@pytest.mark.parametrize("last", [{"kind": "move", "goal": "home"}, {"kind": "line", "frame": "hand", "by": (0, 0, 5)}])
+def test_the_world_is_the_same_after_a_sequence(last: dict[str, Any]) -> None:
+    """Bodies in their order, allowed pairs and held objects, whether it was planned or a step failed after a grasp."""
+    with MotionPlanner("panda") as planner:
+        world, steps = planner.world, shelved(planner)
+        world.add(name="post", box=(0.05, 0.05, 0.2), position=(0.2, 0.6, 0.3))
+        world.attach({"name": "label", "link": "panda_link5", "box": (0.01, 0.01, 0.01), "position": (0.0, 0.0, 0.3)})
+        world.allow("post", "panda_link7")
+        before = [*world.obstacles.items()], [*world.held.items()], world.allowed
+        found = planner.sequence(
+            "home", [*steps[:5], {"kind": "allow", "pairs": [["box", "roof"]]}, last], timeout=20.0
+        )
+        assert bool(found) == (last["kind"] == "move")
+        assert ([*world.obstacles.items()], [*world.held.items()], world.allowed) == before
+
+
 def test_the_grasp_is_one_that_suits_the_place() -> None:
     with MotionPlanner("panda") as planner:
         steps = shelved(planner)
@@ -137,6 +160,22 @@ def test_the_grasp_is_one_that_suits_the_place() -> None:
         assert hand[0, 2] > 0.999  # from the side
         assert "box" in planner.world.obstacles and not planner.world.held  # the world is as before
         assert {step.kind for step in result.steps} == {"goal", "line", "grasp", "move", "release", "retreat"}
+
+
+def test_later_goals_are_rehearsed_with_the_joints_that_are_planned() -> None:
+    """Of two poses only the one of the arm that is planned; the other hand is there already, so that it is nearest."""
+    with MotionPlanner() as planner:
+        robot, at = planner.robot, {side: planner.fk("home", f"{side}_hand")[:3, 3] for side in ("left", "right")}
+        there = PoseTarget(frame="right_hand", position=tuple(at["right"] + (0.0, 0.0, 0.02)))
+        here = PoseTarget(frame="left_hand", position=tuple(at["left"] + (0.0, 0.0, 0.1)))
+        steps = [entry("wait", seconds=0.1), entry("move", goal=AnyOf([there, here])), entry("wait", seconds=0.1)]
+        problem = sequence_problem(robot, planner.problem("home", "home"), steps)
+        mine = StepPlanner(planner.checker, problem, Deadline(10.0), lambda: False)
+        world = TaskWorld.of(robot, problem)
+        for group, side in (("left_arm", "left"), ("right_arm", "right")):
+            (goal,) = Rehearsal(mine, 0, lambda: False, group).later_goals(0, world, robot.home)
+            moved = [name for name, q, home in zip(robot.joint_names, goal, robot.home, strict=True) if q != home]
+            assert moved and all(name.startswith(f"{side}_joint") for name in moved)
 
 
 def test_what_cannot_be_done_is_counted_by_cause() -> None:
@@ -234,8 +273,20 @@ def test_grasps_are_poses_of_the_hand_where_the_object_is() -> None:
         ({"kind": "attach", "object": "box", "link": "foot"}, "expected a hand or a link of the robot"),
         ({"kind": "detach", "object": "box"}, "expected a held object: there is none"),
         ({"kind": "allow", "pairs": [["box", "wall"]]}, "expected links of the robot, or: box"),
-        ({"kind": "together", "steps": [{"kind": "wait", "seconds": 1.0}]}, "after.0.steps"),
+        ({"kind": "allow", "pairs": [["box", "box"]]}, "after.0.pairs.0: the body 'box' is not checked against itself"),
+        ({"kind": "allow", "pairs": []}, "after.0.pairs: expected 1 item or more, got []"),
+        ({"kind": "allow", "pairs": "box"}, "after.0.pairs: expected a list, got 'box'"),
+        ({"kind": "together", "steps": [{"kind": "wait", "seconds": 1.0}]}, "after.0.steps: expected 2 items or more"),
+        ({"kind": "line", "frame": ["hand", "hand", 3], "by": (0, 0, 1)}, "after.0.frame.2: "),
         ({"kind": "move", "goal": "hme"}, "did you mean 'home'"),
+        (
+            {"kind": "move", "goal": {"joints": {"joint1": 0.0}}, "blend": 0.1},
+            "after.0.goal.joints: unknown joint, did you mean",
+        ),
+        (
+            {"kind": "move", "blend": 0.1, "goal": {"alignment": {"kind": "pour", "first": "cup", "second": "box"}}},
+            "after.0.goal: expected a possible goal (unknown held object in goal.alignment 'cup'",
+        ),
         ({"kind": "line", "frame": "hand", "by": (0, 0, 0.1), "blend": -1.0}, "after.0.blend"),
         (7, "steps[0]: expected a step such as"),
     ],
@@ -246,6 +297,42 @@ def test_faulty_steps_are_named(step: Any, words: str) -> None:
         with pytest.raises(ApexError) as raised:
             planner.sequence("home", [step])
         assert words in str(raised.value)
+
+
+@pytest.mark.parametrize("kind", ["sequence", "plan"])
+def test_faulty_files_are_refused_in_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """Exit code 2, and nothing is planned before the fault of a later step is found."""
+    home, wait = {"joints": "home"}, {"kind": "wait", "seconds": 1.0}
+    for fields, words in (
+        ({"goal": home, "allowed": [["box", "box"]]}, "allowed.0: the body 'box' is not checked against itself"),
+        ({"goal": "home"}, "goal: expected a mapping of keys to values, got 'home'"),
+        ({"goal": {"any_of": []}}, "goal.any_of: expected 1 item or more"),
+        ({"after": wait}, "after: expected a list, got"),
+        ({"after": [wait, None]}, "after.1: expected a mapping of keys to values, got None"),
+        ({"after": [wait, {"kind": "allow", "pairs": [["box", "box"]]}]}, "after.1.pairs.0: the body 'box'"),
+        ({"after": [wait, {"kind": "move", "goal": home, "group": "legs"}]}, "after.1.group: expected names of groups"),
+    ):
+        if kind == "plan" and "legs" in str(fields):
+            continue  # which plans to the goal alone
+        box = {"name": "box", "box": [0.05, 0.05, 0.1], "position": [0.5, -0.2, 0.3]}
+        head = {"schema": "apex-ompl/problem/1", "name": "x", "robot": "panda", "start": "home", "scene": [box]}
+        (tmp_path / "x.yaml").write_text(json.dumps(head | fields))
+        assert main([kind, str(tmp_path / "x.yaml")]) == 2
+        told = capsys.readouterr()
+        assert words in told.err and told.err.count("\n") == 1 and not told.out
+
+
+def test_a_line_that_would_take_hours_is_refused_at_once() -> None:
+    """Its motion would have more states than there is memory for."""
+    with MotionPlanner("panda") as planner:
+        started = time.process_time()
+        task = planner.sequence("home", [{"kind": "line", "frame": "hand", "by": (0, 0, 0.1), "speed": 1e-8}])
+        line = planner.plan_line("home", (0.5, 0.0, 0.5), frame="hand", speed=1e-8)
+        assert time.process_time() - started < 5.0
+    assert "more than 3600 s" in task.reason and task.status is PlanStatus.STEP_FAILED
+    assert "more than 3600 s" in line.reason and line.status is PlanStatus.TIMING_FAILED
 
 
 def test_a_sequence_is_planned_from_its_file_saved_and_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

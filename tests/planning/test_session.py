@@ -16,17 +16,19 @@ import torch
 import trimesh
 from planning import EXACT, within
 
-from apex_ompl import Alignment, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan, points_from_depth
+from apex_ompl import Alignment, AnyOf, MotionPlanner, PlanStatus, PoseTarget, load_problem, plan, points_from_depth
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.conservative import ConservativeChecker
 from apex_ompl.collision.scene_bodies import SceneBodies
 from apex_ompl.errors import ApexError, MissingFileError, ParameterError, UnknownNameError
 from apex_ompl.ompl.validity import full_check
+from apex_ompl.planning import TaskSearch
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Trajectory
+from apex_ompl.timing.combination import rest
 
 POST = {"name": "post", "box": (0.1, 0.1, 0.6), "position": (0.45, 0.0, 0.3)}
 
@@ -343,6 +345,28 @@ def test_a_group_moves_while_the_other_joints_stay(name: str, planner: MotionPla
     assert full_check(CollisionChecker(robot, [Obstacle(**POST)]), result.path, start)
 
 
+def test_of_a_pose_by_name_the_joints_of_the_group_count(planner: MotionPlanner, robot: Robot) -> None:
+    start = robot.home.copy()
+    start[[0, 7]] += 0.3
+    states = [
+        planner.plan(start, goal, group="left_arm").path.states[-1] for goal in ("home", ["home"], AnyOf(["home"]))
+    ]
+    task = planner.sequence(start, [{"kind": "move", "goal": "home", "group": "left_arm"}])
+    assert task, task.reason
+    for end in (*states, task.trajectory.positions[-1]):
+        assert end[0] == robot.home[0] and end[7] == start[7]
+
+
+def test_a_joint_that_stays_outside_of_its_limits_is_an_invalid_start(planner: MotionPlanner, robot: Robot) -> None:
+    start = robot.home.copy()
+    start[10] = 5.0
+    goal = dict(zip(robot.joint_names[:7], robot.home.tolist(), strict=False))
+    still = rest(np.zeros(1), 1.0, ["right_hand_synergy"])
+    for options in ({}, {"while_executing": still}):
+        result = planner.plan(start, goal, group="left_arm", **options)
+        assert result.status is PlanStatus.INVALID_START and "right_joint4 = 5 is outside" in result.reason
+
+
 def test_a_start_a_little_outside_of_its_limits_stays_where_it_is_moved_to(
     planner: MotionPlanner, robot: Robot, tmp_path: Path
 ) -> None:
@@ -431,6 +455,11 @@ def test_both_arms_are_a_group_without_the_hands(planner: MotionPlanner, robot: 
         planner.plan(robot.home, goal, group=[])
 
 
+class Drawn:
+    def sample(self, rng: np.random.Generator) -> None:
+        return None
+
+
 def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> None:
     home, hard = robot.home, load_problem("shelf/hard/800000")
     named = dict(zip(robot.joint_names, home.tolist(), strict=True))
@@ -455,6 +484,19 @@ def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> Non
         ),
         (UnknownNameError, "unknown option 'started'; known", lambda: planner.plan_problem(hard, started=3.0)),
         (UnknownNameError, "unknown group or joint 5", lambda: planner.plan(home, home, group=[5])),
+        (ParameterError, "constraints: expected a list", lambda: planner.plan(home, home, constraints=None)),
+        (ParameterError, "constraints: expected a list", lambda: planner.prove([home], constraints="upright")),
+        (ParameterError, "goal: expected states alone, poses alone", lambda: planner.plan(home, ["home", hand])),
+        (ParameterError, "goal: expected finite numbers, got None", lambda: planner.plan(home, None)),
+        (ParameterError, "problem: expected a Problem", lambda: planner.plan_problem("ball_in_cup")),
+        (ParameterError, "problem: expected a Problem", lambda: planner.plan_task("ball_in_cup")),
+        (ParameterError, "search: expected a TaskSearch", lambda: planner.plan_task(hard, search=3)),
+        (ParameterError, "wanted: expected a whole number, 1", lambda: TaskSearch(wanted=0)),
+        (
+            ParameterError,
+            "goal: expected no object that draws states",
+            lambda: planner.sequence(home, [{"kind": "move", "goal": Drawn()}]),
+        ),
     )
     for error, said, call in faulty:
         with pytest.raises(error, match=said):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,12 +12,14 @@ from apex_ompl import MotionPlanner, PoseTarget, Trajectory
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles
-from apex_ompl.moving.given_motion import GivenMotion, rest, together, until_rest
+from apex_ompl.moving.given_motion import GivenMotion
 from apex_ompl.moving.motion_optimizer import MotionOptimizer
-from apex_ompl.planning.schedules import ArmStep, replaced, schedule
+from apex_ompl.planning import ArmStep, replaced, schedule
 from apex_ompl.planning.while_executing import Asked, WhileExecuting, moved_links
-from apex_ompl.result import PlanStatus
+from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
+from apex_ompl.timing import Timing
+from apex_ompl.timing.combination import rest, superposed, together, until_rest
 from apex_ompl.timing.timed_spline import Start, TimedSpline
 from apex_ompl.timing.trajectory import joined
 
@@ -159,6 +162,7 @@ def test_faulty_motions_are_refused_in_one_sentence(
         ({"while_executing": there_and_back.before(0.2)}, "not at rest at its end"),
         ({"while_executing": there_and_back.after(0.2), "offset": -1.0}, "offset.*not at rest at its start"),
         ({"while_executing": there_and_back, "timing": False}, "timing.*True or a Timing"),
+        ({"offset": 0.1}, "offset: expected 0 without while_executing"),
     )
     for options, words in cases:
         with pytest.raises(ApexError, match=words):
@@ -199,21 +203,197 @@ def test_schedules_keep_their_order_and_are_no_slower_than_synchronous_ones(
     assert np.array_equal(new.motions["left_arm"].positions, known.motions["left_arm"].positions)
 
 
+def step_of(name: str, side: str, goal: object, **more: object) -> ArmStep:
+    return ArmStep(name, f"{side}_arm", goal, **more)  # type: ignore[arg-type]
+
+
+def turned(robot: Robot, side: str, by: float) -> dict[str, float]:
+    """The arm at home, with its first joint turned."""
+    values = arm(robot, robot.home, side)
+    return {**values, f"{side}_joint1": values[f"{side}_joint1"] + by}
+
+
+@pytest.mark.parametrize("later", [1e-16, 1e-13, 5e-10, 2e-9])
+def test_motions_that_end_at_almost_the_same_time_end_at_rest(planner: MotionPlanner, later: float) -> None:
+    """Two arms that do the same end a rounding apart; their motion together has to end in the end of both."""
+    robot = planner.robot
+    motion = planner.plan("home", turned(robot, "left", 0.3), group="left_arm").trajectory
+    assert motion is not None
+    left = motion.selected([name for name in robot.joint_names if name.startswith("left_joint")])
+    slow = left.slower(1.0 + later / left.duration)
+    right = Trajectory(*slow.knots, tuple(name.replace("left", "right") for name in slow.joint_names))
+    both = together([left, right])
+    assert both.duration == right.duration and not both.velocities[-1].any() and not both.accelerations[-1].any()
+    assert GivenMotion.of(robot, both).duration == both.duration
+    added = superposed([(left, 0.0), (slow, 0.0)])
+    assert added.duration == slow.duration and not added.velocities[-1].any() and not added.accelerations[-1].any()
+    assert np.abs(added.positions[-1] - 2.0 * left.positions[-1] + left.positions[0]).max() < 1e-12
+
+
 def test_faulty_steps_are_refused(planner: MotionPlanner, reached: dict[str, dict[str, float]]) -> None:
-    left, right = (ArmStep(side, f"{side}_arm", reached[side]) for side in ("left", "right"))
+    left, right = (step_of(side, side, reached[side]) for side in ("left", "right"))
+    approach = PoseTarget(frame="left_hand", position=MIDDLE, orientation=(1, 0, 0, 0), approach=(0, 0, 0.1))
     cases = (
         ([], "one ArmStep or more"),
+        (left, "one ArmStep or more"),
         ([left, left], "names that differ"),
-        (
-            [left, ArmStep("right", "right_arm", reached["right"], after=("l",))],
-            "unknown step in steps.right.after 'l'",
-        ),
-        ([ArmStep("a", "left_arm", "home", after=("b",)), ArmStep("b", "right_arm", "home", after=("a",))], "circle"),
+        ([left, step_of("right", "right", reached["right"], after=("l",))], "unknown step in steps.right.after 'l'"),
+        ([step_of("a", "left", "home", after="b"), step_of("b", "right", "home", after="a")], "circle"),
         ([left, ArmStep("c", "left_joint1", "home")], "groups that do not share left_joint1"),
         ([left, ArmStep("c", "legs", "home")], "unknown group or joint 'legs'"),
-    )
+        ([step_of("c", "left", "nowhere")], r"steps\.c\.goal: expected a possible goal \(unknown pose"),
+        ([step_of("c", "left", {"left_joint1": 0.1})], r"steps\.c\.goal.*left_joint2' is missing"),
+        ([step_of("c", "left", [0.0, 1.0])], r"steps\.c\.goal.*shape \(16,\)"),
+        ([step_of("c", "left", None)], r"steps\.c\.goal.*expected finite numbers"),
+        ([step_of("c", "left", approach)], r"steps\.c\.goal.*no approach"),
+    )  # fmt: skip
     for steps, words in cases:
         with pytest.raises(ApexError, match=words):
             schedule(planner, "home", steps)
     stuck = schedule(planner, "home", [left, right], most_plans=4)
     assert not stuck and "no order of the steps was found" in stuck.reason and "right_" in stuck.reason
+    assert stuck.result.status is PlanStatus.STEP_FAILED
+    for fields, words in (
+        ({"name": ""}, "step.name: expected a name"), ({"group": ["left_arm"]}, "step.group: expected a name"),
+        ({"after": None}, "steps.a.after: expected names"), ({"after": (["b"],)}, "steps.a.after: expected names"),
+        ({"hold": -1.0}, "steps.a.hold: expected a number"), ({"hold": float("nan")}, "steps.a.hold"),
+    ):  # fmt: skip
+        with pytest.raises(ApexError, match=words):
+            ArmStep(**{"name": "a", "group": "left_arm", "goal": "home", **fields})  # type: ignore[arg-type]
+    assert step_of("a", "left", "home", after="put").after == ("put",)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"group": "left_arm"}, "unknown option 'group'"),
+        ({"snapshot": True}, "unknown option 'snapshot'"),
+        ({"timing": False}, "timing: expected True or a Timing"),
+        ({"timing": Timing(start_velocity=(0.1,) * 16)}, "starts at rest"),
+        ({"seed": -1}, "seed: expected a whole number"),
+    ],
+)
+def test_options_that_a_schedule_cannot_have_are_refused(
+    planner: MotionPlanner, options: dict[str, object], words: str
+) -> None:
+    steps = [step_of("a", "left", "home")]
+    known = schedule(planner, "home", steps, most_plans=1)
+    with pytest.raises(ApexError, match=words):
+        schedule(planner, "home", steps, **options)  # type: ignore[arg-type]
+    if "group" not in options:
+        with pytest.raises(ApexError, match=words):
+            replaced(planner, known, "left_arm", steps, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("mode", ["asynchronous", "sequential"])
+def test_a_schedule_among_moving_obstacles_is_refused(planner: MotionPlanner, mode: str) -> None:
+    """Its motions would be proved among obstacles that stand where they are at time 0."""
+    steps = [step_of(side, side, turned(planner.robot, side, 0.3)) for side in ("left", "right")]
+    planner.world.add(name="ball", sphere={"radius": 0.1}, position=(0.5, 0.0, 1.5), velocity=(0.0, 0.0, -0.5))
+    try:
+        with pytest.raises(ApexError, match="world: expected obstacles that stand still"):
+            schedule(planner, "home", steps, mode=mode, most_plans=2)  # type: ignore[arg-type]
+    finally:
+        planner.world.clear()
+
+
+def test_a_schedule_starts_where_plans_do(planner: MotionPlanner) -> None:
+    """A start a little outside a limit is moved to it, one that is farther outside is no start."""
+    robot, outside = planner.robot, planner.robot.home.copy()
+    outside[[0, 10]] = robot.limits.upper[[0, 10]] + 5e-4
+    steps = [step_of(side, side, "home", hold=0.1) for side in ("left", "right")]
+    found = schedule(planner, outside, steps, most_plans=2)
+    assert found and found.trajectory is not None
+    assert found.trajectory.positions[0, 0] == robot.limits.upper[0]
+    outside[10] = 5.0
+    failed = schedule(planner, outside, steps[:1], most_plans=1)
+    assert failed.result.status is PlanStatus.INVALID_START and "right_joint4 = 5 is outside" in failed.reason
+    assert planner.plan(outside, "home", group="left_arm").status is PlanStatus.INVALID_START
+
+
+def test_the_path_of_a_schedule_is_proved(planner: MotionPlanner) -> None:
+    steps = [step_of(side, side, turned(planner.robot, side, 0.4), hold=0.2) for side in ("left", "right")]
+    found = schedule(planner, "home", steps, most_plans=2)
+    proof = planner.prove(found.result.path)
+    assert found and proof and found.result.clearance == pytest.approx(proof.clearance, abs=2e-5)
+
+
+def test_what_waits_for_a_replaced_step_still_does(planner: MotionPlanner) -> None:
+    robot = planner.robot
+    steps = [
+        step_of("clear", "left", turned(robot, "left", 0.2)),
+        step_of("enter", "right", turned(robot, "right", 0.3), after="clear"),
+        step_of("back", "left", "home"),
+    ]
+    known = schedule(planner, "home", steps, most_plans=3)
+    assert known and {step.name: step.after for step in known.steps}["enter"] == ("clear",)
+    other = step_of("other", "left", turned(robot, "left", -0.3))
+    with pytest.raises(ApexError, match="expected a step 'clear', which 'enter' waits for"):
+        replaced(planner, known, "left_arm", [other])
+    assert replaced(planner, known, "left_arm", [other], after="clear")
+    soon, late = step_of("clear", "left", turned(robot, "left", 0.1)), step_of("clear", "left", "home", hold=9.0)
+    assert replaced(planner, known, "left_arm", [soon, other])
+    failed = replaced(planner, known, "left_arm", [late])
+    assert not failed and "clear: it ends at 9.000 s, and enter starts at" in failed.reason
+    for schedules, group, new, words in (
+        (known, "left_arm", [step_of("other", "right", "home")], "steps of left_arm alone"),
+        (known, "left_arm", other, "one ArmStep or more"),
+        (failed, "left_arm", [other], "known: expected a schedule that was found"),
+        (known, "legs", [other], "unknown group 'legs'"),
+    ):
+        with pytest.raises(ApexError, match=words):
+            replaced(planner, schedules, group, new)  # type: ignore[arg-type]
+
+
+def test_motions_beside_another_keep_the_limits_of_torques_and_tools(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]]
+) -> None:
+    """Retimed motions and those in space and time, too: by inverse dynamics of the own arm alone."""
+    robot = planner.robot
+    start = {name: value for name, value in zip(robot.joint_names, robot.home.tolist(), strict=True)}
+    start = {name: value for name, value in start.items() if "right_joint" not in name}
+    for timing in (Timing(torque_scale=0.4), Timing(max_tool_speed={"left_hand": 0.8})):
+        result = planner.plan(
+            start, reached["left"], group="left_arm", while_executing=there_and_back, timing=timing, timeout=20.0
+        )
+        assert result and result.trajectory is not None, result.reason
+        limits, states = timing.motion_limits(robot), result.trajectory
+        alone = GivenMotion.of(robot, states.selected(robot.joint_names[:7])).combined(
+            rest(robot.home, states.duration, robot.joint_names)
+        )
+        assert limits is not None and max(limits.use(alone).values()) <= 1.0
+
+
+def test_an_arm_waits_where_no_motion_beside_the_others_is_found(
+    planner: MotionPlanner, reached: dict[str, dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that what arms can do one after the other is a schedule in every mode."""
+    robot, known = planner.robot, MotionPlanner.plan
+
+    def plan(self: MotionPlanner, *given: object, **options: object) -> PlanResult:
+        result = known(self, *given, **options)  # type: ignore[arg-type]
+        fails = options.get("while_executing") is not None and result.status is PlanStatus.EXACT_SOLUTION
+        return replace(result, status=PlanStatus.TIMEOUT) if fails else result
+
+    monkeypatch.setattr(MotionPlanner, "plan", plan)
+    steps = [
+        step_of("put", "left", reached["left"]),
+        step_of("away", "left", turned(robot, "left", 0.4)),
+        step_of("take", "right", reached["right"], after="put"),
+    ]
+    found = schedule(planner, "home", steps, most_plans=6)
+    assert found and found.trajectory is not None, found.reason
+    assert collisions(robot, found.trajectory) == 0
+    times = {step.name: step for step in found.steps}
+    assert times["take"].start == times["put"].end  # from then on it waits until the left arm is away
+    waits = GivenMotion.of(robot, found.motions["right_arm"])
+    assert waits.at(times["away"].end) == pytest.approx(waits.at(0.0), abs=1e-12)
+
+
+def test_a_given_motion_may_be_a_rest(planner: MotionPlanner, reached: dict[str, dict[str, float]]) -> None:
+    robot = planner.robot
+    for names in (robot.joint_names, robot.joint_names[7:14]):
+        still = rest(robot.home[[robot.joint_names.index(name) for name in names]], 1.0, names)
+        found = planner.plan("home", reached["left"], group="left_arm", while_executing=still)
+        assert found and found.trajectory is not None and found.trajectory.duration >= 1.0
+        assert not np.ptp(found.trajectory.positions[:, 7:14], axis=0).any()

@@ -187,3 +187,31 @@ def test_files_are_paths_or_content_from_memory_and_long_bodies_are_noted(robot:
         assert "floor is 100 m long; lengths are meters" in result.notes
     with pytest.raises(FileFormatError, match="mesh file ending in"):
         planner.world.add(name="odd", mesh=tmp_path / "cube.txt")
+
+
+def test_a_state_at_which_an_object_is_taken_may_be_a_pose_by_name(robot: Robot) -> None:
+    by_name, by_numbers = (world_of(robot)[0] for _ in range(2))
+    for world, at in ((by_name, "home"), (by_numbers, robot.home)):
+        world.add(name="far", box=(0.1, 0.1, 0.1), position=(2.0, 0.0, 0.5))
+        world.attach("far", "left_hand_palm", at=at)
+    assert by_name.held == by_numbers.held
+    for world, at in ((by_name, "home"), (by_numbers, robot.home)):
+        world.detach("far", at=at)
+    assert by_name.obstacles == by_numbers.obstacles and "far" in by_name.obstacles
+
+
+def test_what_an_edit_cannot_use_is_named_and_changes_nothing(robot: Robot) -> None:
+    world, _ = world_of(robot)
+    world.add(name="far", box=(0.1, 0.1, 0.1), position=(2.0, 0.0, 0.5))
+    before = dict(world.obstacles)
+    for call, words in (
+        (lambda: world.load(None), "problem: expected a Problem"),
+        (lambda: world.load("ball_in_cup"), "problem: expected a Problem"),
+        (lambda: world.allow("far", "left_link5", "no"), "allowed: expected True or False, got 'no'"),
+        (lambda: world.attach("far", "left_hand_palm", at=[0.0, 1.0]), "at: expected a state of shape"),
+        (lambda: world.attach("far", "left_hand_palm", at="hme"), "unknown pose of .* as at 'hme'"),
+        (lambda: world.attach("far", links="left_hand_palm", at="home"), "links, a list of two"),
+    ):
+        with pytest.raises(ApexError, match=words):
+            call()
+        assert dict(world.obstacles) == before and not world.held and not world.allowed

@@ -142,7 +142,7 @@ def test_pose_matrix_is_scipys(q: list[float]) -> None:
         ("sphere: {radius: 0.1}", "mesh: {file: a.step}", ["scene.1.mesh.file", ".stl or .obj or .ply", "a.step"]),
         ("cylinder: {radius: 0.035, length: 0.11}", "half_space: {normal: [0, 0, 1]}", ["half_space cannot be held"]),
         ("axis: [0, 0, 1]", "axis: [0, 0, 0]", ["attached.0.contact.axis", "not zero"]),
-        ("goal: {joints: {a: 1, b: 2}}", "goal: {joints: []}", ["goal.joints", "at least 1 item"]),
+        ("goal: {joints: {a: 1, b: 2}}", "goal: {joints: []}", ["goal.joints", "expected 1 item or more"]),
         ("goal: {joints: {a: 1, b: 2}}", "goal: {joint: {a: 1}}", ["goal.joint", "did you mean 'joints'"]),
     ],
 )  # fmt: skip

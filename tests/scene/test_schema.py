@@ -52,7 +52,7 @@ FAULTS: dict[str, tuple[Callable[[], Any], str]] = {
         lambda: Obstacle(name="a", sphere={"radius": 10**5000}),
         "Obstacle: sphere.radius: input should be a valid number, got <int object",
     ),
-    "plain data": (lambda: Goal.model_validate({"joints": []}), "Goal: joints: tuple should have at least 1 item"),
+    "plain data": (lambda: Goal.model_validate({"joints": []}), "Goal: joints: expected 1 item or more, got []"),
     "json": (lambda: Goal.model_validate_json("{"), "Goal: invalid JSON: "),
     "a change": (
         lambda: setattr(PoseTarget(**POSE), "frame", "b"),

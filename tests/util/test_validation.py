@@ -66,6 +66,8 @@ MASKED = np.ma.masked_array([1.0, 2.0], mask=[True, False])
         (lambda: v.check_states(np.zeros((0, 4)), 4, "path", least=1), "shape (N, 4), N at least 1, got (0, 4)"),
         (lambda: v.check_path(np.zeros((1, 4))), "finite numbers of shape (N, dof), N at least 2, got (1, 4)"),
         (lambda: v.check_path([[0.0], [np.inf]]), "finite numbers of shape (N, dof), N at least 2, got inf"),
+        (lambda: v.check_path([[0.0], [None]]), "path: expected numbers, got [[0.0], [None]]"),
+        (lambda: v.finite_array(None, "goal"), "goal: expected finite numbers, got None"),
         (lambda: v.check_times(np.array([0.0, 1.0, 1.0])), "times: expected times that start at 0 and increase"),
         (lambda: v.check_times(np.array([0.0, 1.0]), 3), "times: expected finite numbers of shape (3,)"),
     ],
