@@ -29,6 +29,7 @@ from apex_ompl.robot.joint_order import name_back, names_in_order
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import narrowed
 from apex_ompl.util.display import counted, html_table, one_line
 from apex_ompl.util.schema import StrictModel
 from apex_ompl.util.validation import number_array, shape_error
@@ -291,11 +292,8 @@ class Robot:
         Returns:
             Lowest and highest values, shape (dof,) each.
         """
-        low, high, half = self.limits.lower, self.limits.upper, TURN * turns
-        return (
-            np.where(self.continuous, np.maximum(low, q - half), low),
-            np.where(self.continuous, np.minimum(high, q + half), high),
-        )
+        half = TURN * turns
+        return narrowed((self.limits.lower, self.limits.upper), self.continuous, q - half, q + half)
 
     def random_state(self, rng: np.random.Generator, size: int | None = None) -> Array:
         """Return states drawn uniformly inside the limits, continuous joints within a turn; (dof,) or (size, dof)."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ompl import base as ob
-from small_arm import JOINT, write_arm
+from small_arm import JOINT, write_endless
 
 from apex_ompl import plan
 from apex_ompl.collision import CollisionChecker
@@ -23,17 +23,6 @@ from apex_ompl.types import Array
 TURN = 2.0 * math.pi
 DEGREE = math.pi / 180.0
 WALL = {"name": "wall", "box": [0.9, 0.05, 3.0], "position": [0.6, 0.0, 0.5]}
-
-
-def write_endless(folder: Path, joints: tuple[str, ...] = ("turn",), more: str = "") -> Path:
-    """Write the small arm with continuous joints and further elements; return the robot's file."""
-    file = write_arm(folder)
-    urdf = folder / "small_arm.urdf"
-    text = urdf.read_text()
-    for name in joints:
-        text = text.replace(f'name="{name}" type="revolute"', f'name="{name}" type="continuous"')
-    urdf.write_text(text.replace("</robot>", more + "</robot>"))
-    return file
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +144,7 @@ def test_half_a_range_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_base_drives_in_the_plane_by_one_line(tmp_path: Path) -> None:
-    file = write_arm(tmp_path)
+    file = write_endless(tmp_path, ())
     text = file.read_text()
     file.write_text(text.replace("urdf: small_arm.urdf}", "urdf: small_arm.urdf, planar: {x: [-2, 3], y: [1, 4]}}"))
     robot = load_robot(file)
