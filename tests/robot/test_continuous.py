@@ -15,6 +15,7 @@ from apex_ompl import plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.ompl.setup import TURNED_GOALS, assemble
+from apex_ompl.result import PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import Goal, Problem
@@ -93,6 +94,15 @@ def test_the_other_way_round_is_taken_where_the_shorter_one_is_blocked(tmp_path:
         assert result.path is not None, result.reason
         assert result.path.states[-1, 0] == pytest.approx(TURN - 0.5, abs=1e-9)
         assert np.abs(np.diff(result.path.sample(0.01)[:, 0])).max() < 0.02
+
+
+def test_why_a_goal_is_invalid_is_said_once(robot: Robot) -> None:
+    """A goal in collision is so after each of its turns."""
+    blocked = np.array([0.0, 1.2, 0.3])
+    setup = assemble(problem(robot, np.array([1.5, 0.4, 0.6]), blocked, (WALL,)), robot)
+    assert len(setup.goal_faults) >= 4 and all(setup.goal_faults)
+    result = plan(problem(robot, np.array([1.5, 0.4, 0.6]), blocked, (WALL,)))
+    assert result.status is PlanStatus.INVALID_GOAL and result.reason.count("<->") == 1
 
 
 def test_states_after_whole_turns_are_checked_alike(robot: Robot) -> None:
