@@ -87,10 +87,10 @@ def draw_simple(
         tables = cell.tables.whole
         poses = HandPoseSampler(cell.tables, (), MARGIN)
         regions = [cell.wide_region(arm) for arm in range(len(cell.arms))]
-        found = [poses.sample(rng, regions, synergies) for _ in range(2)]
-        if found[0] is None or found[1] is None:
+        start, goal = (poses.sample(rng, regions, synergies) for _ in range(2))
+        if start is None or goal is None:
             return None
-        ends = np.stack([q for q in found if q is not None])
+        ends = _turned(start, goal, cell)
     scene = _draw_obstacles(rng, cell, tables, ends)
     return DrawnProblem(scene, ends[0], ends[1], attached)
 
@@ -177,7 +177,7 @@ def _candidate(rng: np.random.Generator, suite: str, grammar: Grammar, held: Hel
     else:
         sent = way >= ALIGNED + MET
         sampler = EndSampler(held, cell.outward(scene.parts) if sent else (), scene.places if sent else (), margin)
-        ends = _ends(rng, sampler)
+        ends = _ends(rng, sampler, cell)
     if ends is None or np.abs(ends[0] - ends[1]).max() < LEAST_MOTION:
         return None
     palms = tips_on_line(cell, held.tables.whole, ends, 9)
@@ -208,10 +208,15 @@ def composition(rng: np.random.Generator, suite: str, grammar: Grammar) -> Compo
     return Composition([*first.parts, *second.parts], [*first.places, *second.places])
 
 
-def _ends(rng: np.random.Generator, sampler: EndSampler) -> Array | None:
+def _ends(rng: np.random.Generator, sampler: EndSampler, cell: Cell) -> Array | None:
     start = sampler.sample(rng)
     goal = None if start is None else sampler.sample(rng)
-    return None if start is None or goal is None else np.stack([start, goal])
+    return None if start is None or goal is None else _turned(start, goal, cell)
+
+
+def _turned(start: Array, goal: Array, cell: Cell) -> Array:
+    """Return start and goal, shape (2, dof), the goal after whole turns that bring it near the start."""
+    return np.stack([start, np.round(cell.robot.turned_to(goal, start), 6)])
 
 
 def _aligned(rng: np.random.Generator) -> tuple[Held, Array | None]:

@@ -278,7 +278,7 @@ class EndSampler:
     def _joints(self, rng: np.random.Generator, *, rest: bool) -> Array | None:
         some, tables = self._cell.robot, self._held.tables
         hands = tables.synergies
-        states = rng.uniform(some.limits.lower, some.limits.upper, (BATCH, some.dof))
+        states = some.random_state(rng, BATCH)
         if rest:
             states[:] = some.home + rng.normal(0.0, REST_SPREAD, (BATCH, some.dof))
         states[:, hands] = rng.uniform(self._held.low, self._held.high, (BATCH, len(hands)))

@@ -31,6 +31,7 @@ from apex_ompl.baselines.damon.manifold_training import sample_states, split_sam
 from apex_ompl.kernel import Kernel, RobotTables
 from apex_ompl.kernel.scene_builder import scene_tables
 from apex_ompl.model.checkpoint import CONFIG
+from apex_ompl.model.query import encoded_range
 from apex_ompl.robot import load_robot
 from apex_ompl.training.store import load
 from apex_ompl.util.entry_point import run_script
@@ -51,7 +52,7 @@ def make(args: argparse.Namespace, dim: int) -> None:
     robot = load_robot(tables.name)
     hands = {hand.synergy for hand in robot.hands.values()}  # they stay as at the start of a query
     joints = np.array([k for k, name in enumerate(tables.joint_names) if name not in hands])
-    lower, upper = tables.arrays.lower[joints], tables.arrays.upper[joints]
+    lower, upper = (ends[joints] for ends in encoded_range(tables))
     every = sample_states(load(args.data / "paths.zip"), joints, args.states, args.along, args.seed)
     sample, held_out = split_sample(every)
 

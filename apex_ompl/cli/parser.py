@@ -415,6 +415,10 @@ def _add_robot(commands: Commands[argparse.ArgumentParser]) -> None:
         "--margin", type=float, default=0.02, metavar="METERS", help="least distance of such a pair "
         "(default: %(default)s)",
     )  # fmt: skip
+    prepare.add_argument(
+        "--graze", type=float, default=1e-3, metavar="METERS", help="depth to which links with one joint between them "
+        "may touch over its whole range, as bearings do, unchecked; 0 for not at all (default: %(default)s)",
+    )  # fmt: skip
     prepare.add_argument("--seed", type=int, default=0, help="of the states (default: %(default)s)")
     prepare.set_defaults(run="robot:prepare")
     train = steps.add_parser("train", help="train a model for a robot; resumes where it was stopped")

@@ -99,6 +99,10 @@ def _summary(robot: Robot, found: Survey) -> Summary:
         rows.append(("always", f"touch at all of {found.pair_samples} states: {_pairs(found.always)}"))
     if found.never:
         rows.append(("never", f"{counted(len(found.never), 'pair')} touch at none of {found.pair_samples} states"))
+    if found.grazing:
+        rows.append(
+            ("grazing", f"touch as bearings do and are not checked: {_pairs(found.grazing)}; see robot prepare")
+        )
     if found.open_meshes:
         rows.append(("open", f"meshes of {_some(found.open_meshes)} are not closed"))
     if found.unlimited:
@@ -119,7 +123,7 @@ def prepare(parsed: argparse.Namespace) -> int:
     """Compute pairs and covers of a robot."""
     settings = Preparation(
         budget=parsed.budget, jobs=parsed.jobs, effort=parsed.effort,
-        pairs=PairSearch(parsed.samples, parsed.margin, parsed.seed, tuple(parsed.soft)),
+        pairs=PairSearch(parsed.samples, parsed.margin, parsed.seed, tuple(parsed.soft), parsed.graze),
     )  # fmt: skip
     with progress_bars() as report:
         done = prepare_robot(parsed.robot, settings, report)
@@ -128,6 +132,9 @@ def prepare(parsed: argparse.Namespace) -> int:
         ("pairs", f"{done.pairs} disabled"),
         ("covers", f"of {counted(sum(done.covers.values()), 'shape')}: {covers}"),
     ]
+    if done.grazing:
+        shallow = f"touch by less than {1e3 * parsed.graze:g} mm, as bearings do, and are not checked"
+        rows.append(("grazing", f"{_pairs(done.grazing)} {shallow}; --graze 0 checks them"))
     if done.missing:
         rows.append(("missing", f"{counted(done.missing, 'cover')}, made at run time until then"))
     if not done.thorough:

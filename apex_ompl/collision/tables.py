@@ -69,7 +69,7 @@ def joint_tree(robot: Robot) -> JointTree:
     Raises:
         RobotError: The motion of a joint is not that of a constant twist about or along an axis.
     """
-    return JointTree(joint_specs(robot))
+    return JointTree(joint_specs(robot), np.flatnonzero(robot.continuous).tolist())
 
 
 def joint_specs(robot: Robot) -> list[JointSpec]:

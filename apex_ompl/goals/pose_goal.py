@@ -128,10 +128,10 @@ class PoseGoal:
 
     def _is_reached(self) -> bool:
         """Whether one of a few descents reaches the poses."""
-        limits, free = self.robot.limits, self.inverse.free
+        free, (lower, upper) = self.inverse.free, self.robot.range_around(self.start)
         states = np.tile(self.start, (HINTS, 1))
         rng, shape = np.random.default_rng(0), (HINTS - 1, len(free))
-        states[1:, free] = rng.uniform(limits.lower[free], limits.upper[free], shape)
+        states[1:, free] = rng.uniform(lower[free], upper[free], shape)
         ends = self.inverse.descend(states, tolerance=RESIDUAL)
         best = ends.states[np.argsort(ends.errors)[:1]]
         return any(within(self.errors(q), self.bounds) for q in best)

@@ -229,7 +229,8 @@ class HandPoseSampler:
         seeds[:, tables.others] = rest[list(tables.others)]
         solver = links.inverse(targets, tables.others)
         descents = solver.descend(seeds, tolerance=POSE_TOLERANCE, max_steps=DESCENT_STEPS)
-        reached = np.round(descents.states[descents.errors <= POSE_TOLERANCE], 6)
+        ends = self.robot.turned_to(descents.states[descents.errors <= POSE_TOLERANCE], self.robot.home)
+        reached = np.round(ends, 6)
         if not len(reached):
             return reached
         reached = reached[[self.robot.limit_fault(q) is None for q in reached]]
@@ -326,7 +327,7 @@ class AlignmentSampler:
         limits = self.robot.limits
         seeds = np.clip(self._around_home(rng, RESTART_SPREAD), limits.lower, limits.upper)
         descents = self._inverse.descend(seeds, max_steps=DESCENT_STEPS)
-        states = np.round(descents.states[descents.errors < RESIDUAL_TOLERANCE], 6)
+        states = np.round(self.robot.turned_to(descents.states[descents.errors < RESIDUAL_TOLERANCE], self.home), 6)
         states = states[self._within_limits(states)]
         clear = states[has_clearance(self.kernel, states, self.margin)]
         return next((q for q in clear if self.goal.is_satisfied(q) and self._checker.is_free(q)), None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
@@ -227,8 +227,13 @@ class JointTree:
         home: Joint of the cluster of each joint's bodies: the joint itself, or the one that carries the hand.
     """
 
-    def __init__(self, joints: Sequence[JointSpec]) -> None:
-        """Read the joints."""
+    def __init__(self, joints: Sequence[JointSpec], endless: Collection[int] = ()) -> None:
+        """Read the joints.
+
+        Args:
+            joints: The joints, parents before their children.
+            endless: Planned joints without a range, of which no bodies share a cluster: balls are made over ranges.
+        """
         self.joints = tuple(joints)
         self.turns = [turn_to(joint.axis if joint.kind != FIXED else None) for joint in joints]
         self.placements = [np.eye(4)]
@@ -238,7 +243,7 @@ class JointTree:
             self.placements.append(product(product(self.turns[joint.parent].T, placement), self.turns[k]))
             self.chains.append([k, *self.chains[joint.parent]])
         drivers = [joint.source for joint in joints if joint.kind != FIXED]
-        self._shared = {source for source in drivers if drivers.count(source) > 1}
+        self._shared = {source for source in drivers if drivers.count(source) > 1 and source not in endless}
         self._fingers = [self._is_finger(k) for k in range(len(joints))]
         self.home = [self._cluster_joint(k) for k in range(len(joints))]
         self._known: dict[tuple[object, ...], object] = {}

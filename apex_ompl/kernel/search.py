@@ -19,7 +19,7 @@ from apex_ompl.kernel.compiled.path.search import shortest_path as compiled_shor
 from apex_ompl.kernel.compiled.path.shortcutting import shortcut_path
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.types import Array
-from apex_ompl.util.arrays import length
+from apex_ompl.util.arrays import length, narrowed
 
 AT_ONCE = 256  # random states between two looks at the clock, where steps are 1 rad and longer
 LEAST_STEP = 0.01  # least longest step: one random state may cost as many as there are across the limits [rad]
@@ -77,11 +77,8 @@ class SearchBuffers:
 def _draw_range(kernel: Kernel, roots: Array) -> tuple[Array, Array]:
     """Return the limits, of continuous joints half a turn beyond the roots, shape (N, dof), at most."""
     limits = kernel.robot.arrays
-    endless = limits.continuous != 0
     low, high = roots.min(axis=0, initial=np.inf) - math.pi, roots.max(axis=0, initial=-np.inf) + math.pi
-    lower = np.where(endless, np.maximum(limits.lower, low), limits.lower)
-    upper = np.where(endless, np.minimum(limits.upper, high), limits.upper)
-    return lower, upper
+    return narrowed((limits.lower, limits.upper), limits.continuous != 0, low, high)
 
 
 class TreePair:

@@ -18,7 +18,7 @@ from apex_ompl.model.config import ModelConfig
 from apex_ompl.model.diffusion import SAMPLERS, Callback, Estimate, NoiseSchedule, Predict, ddpm, noise_like
 from apex_ompl.model.geometry import Numbers
 from apex_ompl.model.guidance import Guidance, guided
-from apex_ompl.model.query import Probes, Query
+from apex_ompl.model.query import Probes, Query, turned_back
 from apex_ompl.model.scene_encoding import KeyStates, encoding_of
 from apex_ompl.paths.spline import Spline
 from apex_ompl.types import Array
@@ -232,7 +232,7 @@ class TrajectoryModel(ABC):
         clock, each = StageClock("condition", "network", "guidance", "decode"), len(first) // len(queries)
         start, goal = (np.array([getattr(q, name) for q in queries], float) for name in ("start", "goal"))
         ends = np.repeat(start, each, axis=0), np.repeat(goal, each, axis=0)
-        condition = self.condition(queries, kernel)
+        condition = self.condition(turned_back(queries, kernel.robot), kernel)
         if len(queries) > 1:
             condition = condition[np.repeat(np.arange(len(queries)), each)]
         clock.lap("condition")

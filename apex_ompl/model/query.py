@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -16,6 +16,7 @@ from apex_ompl.kernel.tables import SceneTables
 from apex_ompl.model.geometry import HeldExtent, ObstacleRecord, rotation_matrices
 from apex_ompl.model.primitive_fit import primitives_like
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import narrowed
 from apex_ompl.util.display import fields_line
 
 HALVES = np.array([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5], [1.0, 0.5, 0.5]], np.float32)
@@ -27,6 +28,8 @@ KINEMATICS_BATCH = 1024
 
 MAX_DISTANCE = 0.4
 """Largest distance among the features of a model; larger ones are clipped [m]."""
+
+TURN = 2.0 * np.pi  # of a continuous joint [rad]
 
 HALF_SPACE_BOX = np.array([3.0, 3.0, 0.5])
 """Half edges of the box that represents a half-space [m]."""
@@ -96,6 +99,21 @@ class ObstacleSet:
         boxes = boxes_around(kind, rotation, position, size)
         exact = np.ones(len(kind), np.int64)
         return tables_of({0: Solids(kind, exact, rotation, position, size, boxes, (None,) * len(kind))})
+
+
+def encoded_range(robot: RobotTables) -> tuple[Array, Array]:
+    """Return the values that networks scale to -1..1: the limits, of continuous joints a turn to either side of 0."""
+    a = robot.arrays
+    return narrowed((a.lower, a.upper), a.continuous != 0, -TURN, TURN)
+
+
+def turned_back(queries: Sequence[Query], robot: RobotTables) -> Sequence[Query]:
+    """Return queries whose continuous joints start within half a turn of 0; goals are moved by as many turns."""
+    endless = robot.arrays.continuous != 0
+    if not endless.any():
+        return queries
+    turns = [np.where(endless, TURN * np.rint(np.asarray(query.start, float) / TURN), 0.0) for query in queries]
+    return [replace(q, start=q.start - by, goal=q.goal - by) for q, by in zip(queries, turns, strict=True)]
 
 
 def _rotation_to(normal: Array) -> Array:

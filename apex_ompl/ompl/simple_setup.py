@@ -70,7 +70,7 @@ class SimpleSetup(og.SimpleSetup):
 
         Args:
             robot: The robot.
-            bounds: Bounds of the state space, by default the robot's limits.
+            bounds: Bounds of the state space, by default those of :func:`apex_ompl.ompl.space.state_space`.
             constraints: Constraints along the path, or None for none.
 
         Raises:

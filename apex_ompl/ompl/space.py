@@ -29,14 +29,15 @@ GOAL_LOOK = 0.002  # period at which a goal that another thread samples is polle
 def state_space(
     robot: Robot, resolution: float = SEARCH_RESOLUTION, bounds: Bounds | None = None
 ) -> ob.RealVectorStateSpace:
-    """Return the state space of a robot: one real dimension per planned joint, bounded by its limits.
+    """Return the state space of a robot: one real dimension for each planned joint.
 
     Args:
         robot: The robot.
         resolution: Longest step that OMPL's own interpolation leaves between states [rad].
-        bounds: Bounds inside the robot's limits, which are the default.
+        bounds: Bounds inside the robot's limits; by default these, of joints that turn without end a turn to either
+            side of 0.
     """
-    lower, upper = bounds or (robot.limits.lower, robot.limits.upper)
+    lower, upper = bounds or robot.range_around(turns=1.0)
     space = ob.RealVectorStateSpace(robot.dof)
     box = ob.RealVectorBounds(robot.dof)
     for k, name in enumerate(robot.joint_names):

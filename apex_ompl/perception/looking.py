@@ -380,7 +380,7 @@ class _Search:
             start[free] += s.spread * far * rng.normal(size=len(free))
             start = start.clip(self._lower, self._upper)
             end = inverse_kinematics.descend(start[None], tolerance=1e-2, max_steps=STEPS).states[0]
-            found.append(end.clip(self._lower, self._upper))
+            found.append(self._robot.turned_to(end, self._state).clip(self._lower, self._upper))
         return np.array(found)
 
     def _targets(self, camera: Camera, face: LinkFace, far: float, rng: np.random.Generator) -> Iterator[Target]:

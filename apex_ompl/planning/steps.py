@@ -146,11 +146,11 @@ def query_fault(setup: PlanningSetup) -> tuple[PlanStatus | None, str, Array | N
     if setup.start_off:
         return PlanStatus.START_OFF_CONSTRAINT, setup.start_off, _nearest(setup, setup.start)
     if all(setup.goal_faults):
-        return PlanStatus.INVALID_GOAL, "; ".join(setup.goal_faults), None
+        return PlanStatus.INVALID_GOAL, "; ".join(dict.fromkeys(setup.goal_faults)), None
     if not len(setup.valid_goals):
         k = next(k for k, off in enumerate(setup.goals_off) if off)
         reasons = (fault or off for fault, off in zip(setup.goal_faults, setup.goals_off, strict=True))
-        return PlanStatus.GOAL_OFF_CONSTRAINT, "; ".join(reasons), _nearest(setup, setup.goals[k])
+        return PlanStatus.GOAL_OFF_CONSTRAINT, "; ".join(dict.fromkeys(reasons)), _nearest(setup, setup.goals[k])
     return None, "", None
 
 

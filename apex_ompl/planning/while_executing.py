@@ -380,10 +380,10 @@ def without_given(checker: CollisionChecker, given: GivenMotion) -> CollisionChe
 @lru_cache(maxsize=16)
 def moved_links(robot: Robot, columns: tuple[int, ...]) -> frozenset[str]:
     """Return the links that some joints move."""
-    states = np.tile(robot.home, (len(columns) + 1, 1))
+    states, (lower, upper) = np.tile(robot.home, (len(columns) + 1, 1)), robot.range_around(robot.home)
     for row, column in enumerate(columns):
-        near = robot.home[column] - robot.limits.lower[column] > robot.limits.upper[column] - robot.home[column]
-        states[row, column] = robot.limits.lower[column] if near else robot.limits.upper[column]
+        near = robot.home[column] - lower[column] > upper[column] - robot.home[column]
+        states[row, column] = lower[column] if near else upper[column]
     data, numbers = robot.model.createData(), {link: robot.link_frame(link) for link in robot.link_names}
     places = list[Array]()
     for q in states:

@@ -16,7 +16,7 @@ from apex_ompl.robot.description import TURNING, Description, Semantics, UrdfJoi
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted
 
-LEAST = 4  # joints of an arm
+LEAST, FEWEST = 4, 2  # joints of an arm, and where no chain has as many: necks and torsos have up to three
 FINGER = re.compile(r"finger|gripper|thumb|index|middle|ring_|little|pinky|hand_|jaw|knuckle|grip", re.I)
 LEG = re.compile(r"(?<![a-z])legs?(?![a-z])|hip_|_hip|knee|ankle|foot|thigh|calf|wheel|caster|steer|_leg|leg_", re.I)
 WHEEL = re.compile(r"wheel|caster", re.I)
@@ -46,13 +46,19 @@ class Arm(NamedTuple):
 
 
 def arms_of(robot: Description, semantics: Semantics | None) -> list[Arm]:
-    """Return the arms of a robot: groups of its SRDF that are chains, else chains of its joints."""
-    chains = dict(_chosen_groups(robot, semantics)) if semantics else {}
-    source = "a group of the SRDF" if chains else f"guessed, as a chain of {LEAST} or more joints"
-    if not chains:
-        found = _limbs(robot)
-        names = _group_names(robot, found)
-        chains = dict(zip(names, found, strict=True))
+    """Return the arms of a robot: groups of its SRDF that are chains, else chains of its joints.
+
+    They are chains of LEAST joints or more, or groups of FEWEST that carry an end effector of the SRDF; where there are
+    none of either, all of FEWEST or more.
+    """
+    chains, source = dict[str, tuple[str, ...]](), ""
+    for least in (LEAST, FEWEST):
+        if semantics is not None and not chains:
+            chains, source = dict(_chosen_groups(robot, semantics, least)), "a group of the SRDF"
+        if not chains:
+            found = _limbs(robot, least)
+            chains = dict(zip(_group_names(robot, found), found, strict=True))
+            source = f"guessed, as a chain of {least} or more joints"
     return [
         Arm(
             group, re.sub(r"_?arm$", "", group) or "hand", joints, palm_of(robot, joints, semantics),
@@ -62,12 +68,16 @@ def arms_of(robot: Description, semantics: Semantics | None) -> list[Arm]:
     ]  # fmt: skip
 
 
-def _chosen_groups(robot: Description, semantics: Semantics) -> Iterable[tuple[str, tuple[str, ...]]]:
-    """Yield the smallest groups that are chains of enough joints and share none."""
+def _chosen_groups(robot: Description, semantics: Semantics, least: int) -> Iterable[tuple[str, tuple[str, ...]]]:
+    """Yield the smallest groups that are chains of so many joints and share none, then those with an end effector."""
     taken: set[str] = set()
-    for name, members in sorted(semantics.groups.items(), key=lambda one: (len(one[1]), one[0])):
+    last = {next((joint.name for joint in robot.ancestors(palm) if joint.free), "") for palm in semantics.palms}
+    order = sorted(semantics.groups.items(), key=lambda one: (len(one[1]) < least, len(one[1]), one[0]))
+    for name, members in order:
         joints = tuple(joint for joint in members if not is_finger(robot, joint))
-        if len(joints) < LEAST or taken & {*joints} or not _is_chain(robot, joints):
+        if len(joints) < FEWEST or taken & {*joints} or not _is_chain(robot, joints):
+            continue
+        if len(joints) < least and joints[-1] not in last:
             continue
         if not any(LEG.search(joint) for joint in (name, *joints)):
             taken |= {*joints}
@@ -88,8 +98,8 @@ def is_finger(robot: Description, name: str) -> bool:
     return any(robot.joints[other].parent != joint.child for other in robot.followers(name))
 
 
-def _limbs(robot: Description) -> list[tuple[str, ...]]:
-    """Return the chains of at least ``LEAST`` joints between branches, without fingers, legs and wheels."""
+def _limbs(robot: Description, least: int) -> list[tuple[str, ...]]:
+    """Return the chains of at least so many joints between branches, without fingers, legs and wheels."""
     kept = [
         joint for joint in robot.joints.values()
         if joint.free and not is_finger(robot, joint.name) and not _is_leg(robot, joint)
@@ -109,7 +119,7 @@ def _limbs(robot: Description) -> list[tuple[str, ...]]:
         chain = [name]
         while len(down.get(chain[-1], [])) == 1:
             chain += down[chain[-1]]
-        if len(chain) >= LEAST and any(robot.joints[one].kind in TURNING for one in chain):
+        if len(chain) >= least and any(robot.joints[one].kind in TURNING for one in chain):
             found.append(tuple(chain))
     return found
 

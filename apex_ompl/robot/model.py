@@ -29,6 +29,7 @@ from apex_ompl.robot.joint_order import name_back, names_in_order
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array, Flags
+from apex_ompl.util.arrays import narrowed
 from apex_ompl.util.display import counted, html_table, one_line
 from apex_ompl.util.schema import StrictModel
 from apex_ompl.util.validation import number_array, shape_error
@@ -125,6 +126,7 @@ class Robot:
         continuous: Which joints turn without end, shape (dof,): states that differ by whole turns of them are alike.
         part_links: Part name -> names of its links.
         urdf: The composed URDF with absolute mesh paths.
+        disabled_pairs: File of pairs of links that are not checked besides those of SRDFs, or None.
         covers: File of the links' sphere covers, or None.
         checkpoint: Folder of the model that the robot file names, which need not exist, or None.
         files: Files that the robot was read from, meshes among them.
@@ -145,6 +147,7 @@ class Robot:
     continuous: Flags
     part_links: Mapping[str, tuple[str, ...]]
     urdf: str
+    disabled_pairs: Path | None
     covers: Path | None
     checkpoint: Path | None
     files: tuple[Path, ...]
@@ -291,11 +294,8 @@ class Robot:
         Returns:
             Lowest and highest values, shape (dof,) each.
         """
-        low, high, half = self.limits.lower, self.limits.upper, TURN * turns
-        return (
-            np.where(self.continuous, np.maximum(low, q - half), low),
-            np.where(self.continuous, np.minimum(high, q + half), high),
-        )
+        half = TURN * turns
+        return narrowed((self.limits.lower, self.limits.upper), self.continuous, q - half, q + half)
 
     def random_state(self, rng: np.random.Generator, size: int | None = None) -> Array:
         """Return states drawn uniformly inside the limits, continuous joints within a turn; (dof,) or (size, dof)."""
@@ -400,10 +400,11 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error
     check_geometry(model, geometry, composition.urdf, path)
     order = _state_order(config, model, path)
-    disabled, files = list(composition.disabled_pairs), [path, *composition.files]
+    disabled, files, pairs_file = list(composition.disabled_pairs), [path, *composition.files], None
     if config.disabled_pairs:
-        files.append(resolve(config.disabled_pairs, path.parent, "file of disabled pairs"))
-        disabled += read_disabled_pairs(files[-1])
+        pairs_file = resolve(config.disabled_pairs, path.parent, "file of disabled pairs")
+        files.append(pairs_file)
+        disabled += read_disabled_pairs(pairs_file)
     pair_up(model, geometry, disabled)
     covers = resolve(config.covers, path.parent, "file of sphere covers") if config.covers else None
     files += [covers] if covers else []
@@ -430,8 +431,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     return Robot(
         name=config.name, joint_names=names, limits=limits, effort=effort, home=home, poses=poses, groups=groups,
         hands=config.hands, model=model, geometry=geometry, fixtures=config.fixtures, weights=weights,
-        continuous=continuous, part_links=composition.part_links, urdf=composition.urdf, covers=covers,
-        checkpoint=None if config.model is None else path.parent / config.model, files=tuple(files), _order=order,
+        continuous=continuous, part_links=composition.part_links, urdf=composition.urdf, disabled_pairs=pairs_file,
+        covers=covers, checkpoint=None if config.model is None else path.parent / config.model, files=tuple(files),
+        _order=order,
     )  # fmt: skip
 
 

@@ -127,7 +127,7 @@ def new_robot(
         part.arms = guesses.arms_of(part.robot, part.semantics)
         if not part.arms:
             raise RobotError(
-                f"{part.file}: expected a chain of {guesses.LEAST} or more joints that are no fingers, legs or wheels"
+                f"{part.file}: expected a chain of {guesses.FEWEST} or more joints that are no fingers, legs or wheels"
                 ", or a group of them in an SRDF"
             )
     _name_parts(parts)

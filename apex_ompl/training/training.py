@@ -20,6 +20,7 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel import RobotTables
 from apex_ompl.model.config import ModelConfig, SplineConfig, key_shapes
 from apex_ompl.model.proposals import Sampling
+from apex_ompl.model.query import encoded_range
 from apex_ompl.training.autoencoder import LinearLatent, VariationalLatent
 from apex_ompl.training.conditions import Conditions
 from apex_ompl.training.config import TrainingConfig
@@ -149,8 +150,7 @@ def initial_network(config: TrainingConfig, data: TrainingData, robot: RobotTabl
             key_shapes(model), (encoding.keys.state, encoding.keys.joint, encoding.keys.ball), strict=True
         ):
             getattr(network, name).copy_(torch.from_numpy(values))
-    limits = (torch.tensor(v, dtype=torch.float32) for v in (robot.arrays.lower, robot.arrays.upper))
-    network.encoder.set_limits(*limits)
+    network.encoder.set_limits(*(torch.tensor(v, dtype=torch.float32) for v in encoded_range(robot)))
     if isinstance(network.autoencoder, LinearLatent):
         network.autoencoder.fit(data.statistics_sample())
     return network

@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
 
 
 def is_masked_array(value: object) -> TypeGuard[np.ma.MaskedArray[Any, Any]]:
@@ -33,6 +33,12 @@ def distinct(values: ArrayLike) -> NDArray[Any]:
     """Return distinct numbers in ascending order, as ``np.unique`` does, which imports ``numpy.ma``."""
     found = np.sort(values, axis=None)
     return np.concatenate([found[:1], found[1:][found[1:] != found[:-1]]])
+
+
+def narrowed(limits: tuple[Array, Array], which: Flags, low: Array | float, high: Array | float) -> tuple[Array, Array]:
+    """Return limits, two arrays of shape (dof,), of which some, ``which``, are cut to ``low`` and ``high``."""
+    lower, upper = limits
+    return np.where(which, np.maximum(lower, low), lower), np.where(which, np.minimum(upper, high), upper)
 
 
 def length(vector: ArrayLike) -> float:

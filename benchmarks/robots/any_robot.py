@@ -1,4 +1,4 @@
-"""Twelve robots from their URDFs: what is proved of their states, what that costs, and how fast they are planned for.
+"""Robots from their URDFs: what is proved of their states, what that costs, and how fast they are planned for.
 
 Each robot is set up by ``apex-ompl robot new`` and prepared by ``apex-ompl robot prepare`` with default settings; a
 preparation that the time budget stopped goes on at the next call of this command. Shares are those of
@@ -10,7 +10,7 @@ counted and left out. ``in 1 s`` is the share of the others that was solved in 1
 all of them, those without a path last. Lengths are medians over the problems that both solved. Figures are kept in
 benchmarks/runs/robots, a file a robot; the command makes what is missing.
 
-Usage: python -m benchmarks.robots.any_robot [ROBOT...] [-n 100] [--budget 300] [--folder FOLDER]
+Usage: python -m benchmarks.robots.any_robot [ROBOT...] [-n 100] [--budget 300] [--folder FOLDER] [--name robots]
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ def main() -> None:
     parser = record.parser(__doc__, n=100, of="problems of a robot")
     parser.add_argument("robots", nargs="*", help=f"by default all of {', '.join(CELLS)}")
     parser.add_argument("--first", type=int, default=FIRST, help="first problem (default: %(default)s)")
+    parser.add_argument("--name", default="robots", help="of the results (default: %(default)s)")
     figures.add_options(parser, FOLDER)
     args = parser.parse_args()
     names = [str(k) for k in range(args.first, args.first + args.n)]
@@ -50,7 +51,7 @@ def main() -> None:
         boxes = cache(lambda file=file: Boxes(load_robot(file), str(file)))
         mine.run(names, lambda name, boxes=boxes: boxes().problem(int(name)))
         rows[robot] = mine, names
-    record.write("robots", *figures.table(rows), n=args.n, budget=args.budget, **figures.SETTINGS)
+    record.write(args.name, *figures.table(rows), n=args.n, budget=args.budget, **figures.SETTINGS)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""The twelve robots of the benchmark of robots: of the PyPI package example-robot-data, and a planar one made here."""
+"""The robots of the benchmark of robots: of the PyPI package example-robot-data, and a planar one made here."""
 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,16 +25,19 @@ class Cell:
         urdf: URDF in the package, or ``PLANAR``.
         srdf: SRDF in the package, or an empty string.
         places: x, y, z [m] and yaw [rad] of each arm.
+        torso: Joint that is planned, too, which ``robot new`` locks, or an empty string.
     """
 
     urdf: str
     srdf: str = ""
     places: tuple[Place, ...] = ((0.0, 0.0, 0.0, 0.0),)
+    torso: str = ""
 
 
 PANDA = "panda_description/urdf/panda.urdf", "panda_description/srdf/panda.srdf"
 UR5 = "ur_description/urdf/ur5_robot.urdf", "ur_description/srdf/ur5.srdf"
 XARM7 = "xarm_description/urdf/xarm7.urdf", "xarm_description/srdf/xarm7.srdf"
+PR2 = "pr2_description/urdf/pr2.urdf", "pr2_description/srdf/pr2.srdf"
 CELLS = {
     "panda": Cell(*PANDA),
     "xarm7": Cell(*XARM7),
@@ -42,7 +46,8 @@ CELLS = {
     "dual_ur5": Cell(*UR5, ((0.0, 0.5, 0.0, 0.0), (0.0, -0.5, 0.0, 0.0))),
     "dual_panda": Cell(*PANDA, ((0.0, 0.4, 0.0, 0.0), (0.0, -0.4, 0.0, 0.0))),
     "three_xarm7": Cell(*XARM7, ((0.0, 0.6, 0.0, 0.0), (0.0, -0.6, 0.0, 0.0), (0.9, 0.0, 0.0, math.pi))),
-    "pr2": Cell("pr2_description/urdf/pr2.urdf", "pr2_description/srdf/pr2.srdf"),
+    "pr2": Cell(*PR2),
+    "pr2_torso": Cell(*PR2, torso="torso_lift_joint"),
     "tiago_pro": Cell("tiago_pro_description/robots/tiago_pro.urdf"),
     "tiago_dual": Cell("tiago_description/robots/tiago_dual.urdf"),
     "talos": Cell("talos_data/robots/talos_reduced.urdf", "talos_data/srdf/talos.srdf"),
@@ -79,4 +84,8 @@ def robot_file(name: str, folder: Path) -> Path:
         urdf = str(file.parent / PLANAR)
         write_atomically(Path(urdf), planar_arm().encode())
     places = cell.places if len(cell.places) > 1 else ()
-    return new_robot(sources_of([urdf] * len(cell.places), srdfs, places), file).file
+    made = new_robot(sources_of([urdf] * len(cell.places), srdfs, places), file).file
+    if cell.torso:  # by hand, as a comment in the file has it
+        text = made.read_text().replace(f"  # {cell.torso}: {{", f"  {cell.torso}: {{")
+        write_atomically(made, re.sub(rf"(?m)^  {cell.torso}: [^{{\n]*\n", "", text).encode())
+    return made

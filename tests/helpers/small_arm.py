@@ -37,6 +37,17 @@ def write_arm(folder: Path) -> Path:
     return folder / "small_arm.robot.yaml"
 
 
+def write_endless(folder: Path, joints: tuple[str, ...] = ("turn",), more: str = "") -> Path:
+    """Write the small arm with continuous joints and further elements; return the robot's file."""
+    file = write_arm(folder)
+    urdf = folder / "small_arm.urdf"
+    text = urdf.read_text()
+    for name in joints:
+        text = text.replace(f'name="{name}" type="revolute"', f'name="{name}" type="continuous"')
+    urdf.write_text(text.replace("</robot>", more + "</robot>"))
+    return file
+
+
 def arm_problem(folder: Path) -> Problem:
     """A turn of the arm past a wall."""
     wall = {"name": "wall", "box": [0.3, 0.05, 1.0], "position": [0.45, 0.0, 0.5]}

@@ -96,7 +96,8 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ((0,), "robot check arm.robot.yaml --samples 100 --json"),
     (
         (0,),
-        "robot prepare arm.robot.yaml --budget 120 --jobs 2 --effort 1 --samples 600 --margin 0.01 --seed 1 --soft arm",
+        "robot prepare arm.robot.yaml --budget 120 --jobs 2 --effort 1 --samples 600 --margin 0.01 --seed 1 --soft arm "
+        "--graze 0",
     ),
     ((0,), "robot check arm.robot.yaml"),
     ((0,), "robot train arm.robot.yaml --hours 0.001 --jobs 1 --seed 1 --out training"),

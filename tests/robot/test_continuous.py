@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from ompl import base as ob
-from small_arm import JOINT, write_arm
+from small_arm import JOINT, write_endless
 
 from apex_ompl import plan
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ApexError
 from apex_ompl.ompl.setup import TURNED_GOALS, assemble
+from apex_ompl.result import PlanStatus
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import Goal, Problem
@@ -23,17 +24,6 @@ from apex_ompl.types import Array
 TURN = 2.0 * math.pi
 DEGREE = math.pi / 180.0
 WALL = {"name": "wall", "box": [0.9, 0.05, 3.0], "position": [0.6, 0.0, 0.5]}
-
-
-def write_endless(folder: Path, joints: tuple[str, ...] = ("turn",), more: str = "") -> Path:
-    """Write the small arm with continuous joints and further elements; return the robot's file."""
-    file = write_arm(folder)
-    urdf = folder / "small_arm.urdf"
-    text = urdf.read_text()
-    for name in joints:
-        text = text.replace(f'name="{name}" type="revolute"', f'name="{name}" type="continuous"')
-    urdf.write_text(text.replace("</robot>", more + "</robot>"))
-    return file
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +96,15 @@ def test_the_other_way_round_is_taken_where_the_shorter_one_is_blocked(tmp_path:
         assert np.abs(np.diff(result.path.sample(0.01)[:, 0])).max() < 0.02
 
 
+def test_why_a_goal_is_invalid_is_said_once(robot: Robot) -> None:
+    """A goal in collision is so after each of its turns."""
+    blocked = np.array([0.0, 1.2, 0.3])
+    setup = assemble(problem(robot, np.array([1.5, 0.4, 0.6]), blocked, (WALL,)), robot)
+    assert len(setup.goal_faults) >= 4 and all(setup.goal_faults)
+    result = plan(problem(robot, np.array([1.5, 0.4, 0.6]), blocked, (WALL,)))
+    assert result.status is PlanStatus.INVALID_GOAL and result.reason.count("<->") == 1
+
+
 def test_states_after_whole_turns_are_checked_alike(robot: Robot) -> None:
     rng = np.random.default_rng(2)
     checker = CollisionChecker(robot, problem(robot, np.zeros(3), np.zeros(3), (WALL,)).scene)
@@ -155,7 +154,7 @@ def test_half_a_range_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_base_drives_in_the_plane_by_one_line(tmp_path: Path) -> None:
-    file = write_arm(tmp_path)
+    file = write_endless(tmp_path, ())
     text = file.read_text()
     file.write_text(text.replace("urdf: small_arm.urdf}", "urdf: small_arm.urdf, planar: {x: [-2, 3], y: [1, 4]}}"))
     robot = load_robot(file)

@@ -40,7 +40,7 @@ FAULTS: dict[str, tuple[dict[str, str], str]] = {
     "not XML": ({"</robot>": ""}, "not valid XML"),
     "empty": ({}, "not valid XML"),
     "another root": ({"<robot": "<sdf", "</robot>": "</sdf>"}, "expected the element <robot>, got <sdf>"),
-    "no arm": ({}, "expected a chain of 4 or more joints"),
+    "no arm": ({}, "expected a chain of 2 or more joints"),
 }
 LOOP = (
     '<link name="a"/><link name="b"/><joint name="ab" type="fixed"><parent link="a"/><child link="b"/></joint>'
@@ -238,6 +238,31 @@ def test_limbs_are_found_without_fingers_and_legs(tmp_path: Path) -> None:
     found = arms_of(read_description(tmp_path / "h.urdf"), None)
     assert [arm.group for arm in found] == ["left_arm", "right_arm"] and {len(arm.joints) for arm in found} == {5}
     assert found[0].palm == "left_arm4" and found[1].palm == "right_arm4"
+
+
+def test_groups_of_three_joints_are_arms_where_an_srdf_says_so(tmp_path: Path) -> None:
+    """With an end effector beside other arms, else where nothing longer is there: heads and torsos are no arms."""
+    urdf = write_toy(tmp_path)
+    robot = read_description(urdf)
+    three = '<group name="short"><joint name="joint2"/><joint name="joint3"/><joint name="joint4"/></group>'
+    two = '<group name="head"><joint name="joint1"/><joint name="joint2"/></group>'
+    tool = '<end_effector name="tool" parent_link="part4" group="gripper"/>'
+    for text, expected in (
+        (three + tool, {"short": 3}),
+        (three + two + tool, {"short": 3}),
+        (three, {"arm": 4}),  # of the URDF
+        (SRDF.split(">", 1)[1].removesuffix("</robot>") + two, {"manipulator": 4}),
+    ):
+        (tmp_path / "g.srdf").write_text(f"<robot>{text}</robot>")
+        arms = arms_of(robot, read_semantics(tmp_path / "g.srdf", robot))
+        assert {arm.group: len(arm.joints) for arm in arms} == expected
+    planar = read_description(write_toy(tmp_path, {'name="joint4" type="revolute"': 'name="joint4" type="fixed"'}))
+    assert [(arm.group, len(arm.joints)) for arm in arms_of(planar, None)] == [("arm", 3)]
+    (tmp_path / "g.srdf").write_text(f"<robot>{three.replace('joint4', 'joint1')}</robot>")
+    arms = arms_of(planar, read_semantics(tmp_path / "g.srdf", planar))
+    assert [(arm.group, arm.palm) for arm in arms] == [("short", "part4")]
+    made = new_robot(sources_of([str(urdf)]), tmp_path / "toy.robot.yaml")
+    assert load_robot(made.file).dof == 3 and "3 joints joint1 to joint3" in made.file.read_text()
 
 
 def test_groups_of_an_srdf_are_joints_links_chains_and_groups(tmp_path: Path) -> None:

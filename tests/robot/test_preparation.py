@@ -8,8 +8,8 @@ import pytest
 from toy_robot import LIMIT, write_toy
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.cover import preparation
-from apex_ompl.collision.cover.neighbors import apart_over, reason_of_neighbors, taken_in
+from apex_ompl.collision.cover import pairs, preparation
+from apex_ompl.collision.cover.neighbors import GRAZING, apart_over, reason_of_neighbors, taken_in
 from apex_ompl.collision.cover.pairs import PairSearch
 from apex_ompl.collision.cover.preparation import Preparation, prepare
 from apex_ompl.collision.cover.spheres import make_cover, read_covers, read_efforts, unproved
@@ -49,18 +49,18 @@ def write_arm(folder: Path, edits: dict[str, str] | None = None) -> Path:
 
 @pytest.mark.parametrize("named", [False, True])
 def test_a_prepared_robot_names_its_files_and_keeps_its_comments(tmp_path: Path, named: bool) -> None:
-    pairs, covers = ("a.yaml", "b.json") if named else ("my.pairs.yaml", "my.spheres.json")
-    path = write_bars(tmp_path, f"disabled_pairs: {pairs}\ncovers: {covers}\n" * named)
+    pairs_file, covers = ("a.yaml", "b.json") if named else ("my.pairs.yaml", "my.spheres.json")
+    path = write_bars(tmp_path, f"disabled_pairs: {pairs_file}\ncovers: {covers}\n" * named)
     for _ in range(2):
         done = prepare(path, QUICK)
         assert done.thorough and done.pairs == 3 and done.covers == {1: 1} and done.missing == 0
         text = path.read_text()
         lines = sorted(text.removeprefix(FILE).splitlines())
-        assert text.startswith(FILE) and lines == [f"covers: {covers}", f"disabled_pairs: {pairs}"]
+        assert text.startswith(FILE) and lines == [f"covers: {covers}", f"disabled_pairs: {pairs_file}"]
         robot = load_robot(path)
         assert robot.covers == tmp_path / covers and not robot.geometry.collisionPairs
-        assert read_disabled_pairs(tmp_path / pairs) == [("base", "on"), ("base", "tip"), ("on", "tip")]
-    assert sorted(p.name for p in tmp_path.iterdir()) == sorted({"my.urdf", "my.robot.yaml", pairs, covers})
+        assert read_disabled_pairs(tmp_path / pairs_file) == [("base", "on"), ("base", "tip"), ("on", "tip")]
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted({"my.urdf", "my.robot.yaml", pairs_file, covers})
 
 
 def test_covers_are_proved_and_one_for_each_shape(tmp_path: Path) -> None:
@@ -141,22 +141,44 @@ def test_neighbors_are_proved_apart_over_a_joint_as_by_brute_force(tmp_path: Pat
         assert checks.hits(states).any() == (reach > 2.0)
 
 
-@pytest.mark.parametrize(("gap", "reason"), [(0.05, "never, at"), (-0.3, "adjacent"), (-1.6, "")])
-def test_neighbors_that_touch_as_bearings_do_are_told_from_others(tmp_path: Path, gap: float, reason: str) -> None:
+def write_cubes(folder: Path, gap: float) -> Path:
+    """Write two cubes that turn against each other, some millimeters apart, or in contact below 0."""
     cube = "".join(f"v {x} {y} {z}\n" for x in (0, 0.1) for y in (0, 0.1) for z in (0, 0.1))
     sides = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
     faces = "".join(f"f {a} {b} {c}\nf {a} {c} {d}\n" for a, b, c, d in map(str.split, sides))
-    (tmp_path / "cube.obj").write_text(cube + faces)
+    (folder / "cube.obj").write_text(cube + faces)
     body = '<collision><geometry><mesh filename="cube.obj"/></geometry></collision>'
     text = BARS.replace(BAR, body).replace('xyz="0 0 0.3"', f'xyz="0 0 {0.1 + 1e-3 * gap}"')
-    (tmp_path / "my.robot.yaml").write_text(FILE)
-    (tmp_path / "my.urdf").write_text(text.replace('axis xyz="0 1 0"', 'axis xyz="0 0 1"'))
-    robot, _, _ = bare_robot(str(tmp_path / "my.robot.yaml"))
+    (folder / "my.robot.yaml").write_text(FILE)
+    (folder / "my.urdf").write_text(text.replace('axis xyz="0 1 0"', 'axis xyz="0 0 1"'))
+    return folder / "my.robot.yaml"
+
+
+@pytest.mark.parametrize(("gap", "reason"), [(0.05, "never, at"), (-0.3, "adjacent"), (-1.6, "")])
+def test_neighbors_that_touch_as_bearings_do_are_told_from_others(tmp_path: Path, gap: float, reason: str) -> None:
+    robot, _, _ = bare_robot(str(write_cubes(tmp_path, gap)))
     (pair,) = [p for p in enabled_pairs(robot) if links_of_pair(robot, p) == ("base", "on")]
-    assert reason_of_neighbors(robot, pair).startswith(reason) and (reason or not reason_of_neighbors(robot, pair))
+    found, strict, lax = (reason_of_neighbors(robot, pair, graze) for graze in (1e-3, 0.0, 4e-3))
+    assert found.startswith(reason) and bool(found) == bool(reason)
+    assert strict == (found if gap > 0.0 else "")  # what touches is checked
+    assert lax.startswith(GRAZING if gap < 0.0 else reason)
     mesh = robot.geometry.geometryObjects[0].geometry
     inner, outer = np.array(taken_in(mesh, 0.01).vertices()), np.array(mesh.vertices())
     assert np.allclose(np.linalg.norm(inner - outer, axis=1), 0.01) and (np.abs(inner - 0.05) < 0.0465).all()
+
+
+def test_pairs_that_graze_are_named_and_may_be_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cubes that are in contact at every angle are otherwise disabled as those that always touch."""
+    monkeypatch.setattr(pairs, "ALWAYS", 1.1)
+    file = write_cubes(tmp_path, -0.3)
+    for graze in (1e-3, 0.0, 1e-3):  # another depth decides the pairs anew
+        done = prepare(file, Preparation(effort=1, pairs=PairSearch(samples=500, graze=graze)))
+        named = (("base", "on"), ("on", "tip")) if graze else ()
+        assert done.grazing == named and survey(load_robot(file), 50).grazing == named
+        assert (named == ()) == bool(enabled_pairs(load_robot(file)))
+    for depth in (-1e-3, 0.02, math.nan):
+        with pytest.raises(ParameterError, match="graze"):
+            PairSearch(graze=depth)
 
 
 def test_soft_parts_are_parts_of_the_robot(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from apex_ompl.baselines.damon.lazy_search import Graph, LazySearch
 from apex_ompl.baselines.damon.manifold import Manifold, StateAutoencoder
 from apex_ompl.kernel import Kernel
+from apex_ompl.robot.model import TURN, Robot
 from apex_ompl.types import Array, Flags, Indices
 
 POOL = 5  # times as many nodes are nearest in the latent space as are joined: those of them nearest in joint space
@@ -171,6 +171,7 @@ class Damon:
         kind: ``decoded``, or ``stored``, for nodes that are training states: not the paper's, but more generous.
         graph: The graph of its nodes of that kind.
         joints: Which joints of the robot it has values of, shape (J,).
+        endless: Which of these turn without end, shape (J,): the graph is turned to a start by whole turns of them.
         connections: Number of nodes over which paths may leave each start, and reach each goal, at first; three times
             as many each time that these lead to no path.
     """
@@ -179,19 +180,24 @@ class Damon:
     kind: str
     graph: Graph
     joints: Indices
+    endless: Flags
     connections: int
 
     @classmethod
-    def of(cls, manifold: Manifold, names: Sequence[str], kind: str, connections: int) -> Damon:
-        """Return queries of a manifold, for a robot with joints of given names."""
-        joints = np.array([list(names).index(name) for name in manifold.config.joints])
-        return cls(manifold, kind, manifold.graph(kind), joints, connections)
+    def of(cls, manifold: Manifold, robot: Robot, kind: str, connections: int) -> Damon:
+        """Return queries of a manifold for its robot."""
+        joints = np.array([robot.joint_names.index(name) for name in manifold.config.joints])
+        return cls(manifold, kind, manifold.graph(kind), joints, robot.continuous[joints], connections)
 
     def states(self, start: Array) -> Array:
         """Return the states of the nodes, shape (N, dof); other joints are as at a start, shape (dof,)."""
         states = np.repeat(start[None], len(self.graph.states), axis=0)
-        states[:, self.joints] = self.graph.states
+        states[:, self.joints] = self.graph.states + self._turns(start)
         return states
+
+    def _turns(self, q: Array) -> Array:
+        """Return the whole turns of a state, shape (dof,), from the graph's range, shape (J,) [rad]."""
+        return np.where(self.endless, TURN * np.rint(q[self.joints] / TURN), 0.0)
 
     def search(
         self, states: Array, usable: Flags, starts: Array, goals: Array, *, free_nodes: Flags | None = None
@@ -206,7 +212,7 @@ class Damon:
             free_nodes: Which nodes are known to be free, shape (N,); by default those that may be used.
         """
         search = LazySearch(replace(self.graph, states=states), usable, starts, goals, free_nodes=free_nodes)
-        left, count = np.flatnonzero(usable), 0
+        left, count, turns = np.flatnonzero(usable), 0, self._turns(starts[0])
 
         def connect() -> bool:
             """Connect the nearest nodes, and then three times as many each time, as long as there are more."""
@@ -214,10 +220,10 @@ class Damon:
             known, count = count, WIDER * count or self.connections
             if known >= len(left):
                 return False
-            latent, nodes = self.manifold.latent[left], self.graph.states[left]
+            latent, nodes = self.manifold.latent[left], states[left][:, self.joints]
             for rows, which in ((starts, "start"), (goals, "goal")):
                 for k, q in enumerate(rows[:, self.joints]):
-                    z = self.manifold.autoencoder.encode(q[None])[0]
+                    z = self.manifold.autoencoder.encode((q - turns)[None])[0]
                     near = nearest_nodes(latent, nodes, z, q, count)
                     if known:
                         near = np.setdiff1d(near, nearest_nodes(latent, nodes, z, q, known))

@@ -130,4 +130,4 @@ class DAMONParameters(Parameters):
         validator = PathValidator.of_setup(si, NAME)
         robot = validator.checker.robot
         manifold = shared_manifold(self.model, robot.name)
-        return DAMON(si, validator, Damon.of(manifold, robot.joint_names, self.nodes, self.connections))
+        return DAMON(si, validator, Damon.of(manifold, robot, self.nodes, self.connections))

@@ -50,7 +50,7 @@ class DamonReplanner:
         values = DAMONParameters()
         robot = context.setup.robot
         manifold = shared_manifold(values.model, robot.name)
-        self.damon = Damon.of(manifold, robot.joint_names, values.nodes, values.connections)
+        self.damon = Damon.of(manifold, robot, values.nodes, values.connections)
         self._usable.clear()
         self._clear_of_static.clear()
         self._blocked.clear()

@@ -64,11 +64,11 @@ class DynamicRRTReplanner:
 
     def _grown(self, search: Search, tree: GoalTree, clear: Clearances) -> Array | None:
         """Grow the tree until it has the robot's state; return its path, or None where the time is up."""
-        start, rng, robot = search.start.position, search.rng, search.context.setup.robot.limits
-        fingers = search.context.fingers
+        start, rng, robot = search.start.position, search.rng, search.context.setup.robot
+        fingers, (lower, upper) = search.context.fingers, robot.range_around(start, turns=1.0)
 
         def sample() -> Array:
-            q = rng.uniform(robot.lower, robot.upper)
+            q = rng.uniform(lower, upper)
             q[fingers] = start[fingers]
             search.budget.spend("extension of a tree")
             return q

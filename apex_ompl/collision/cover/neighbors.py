@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import coal
 import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision.shapes import is_shell, mesh_geometry
+from apex_ompl.robot.config import read_disabled_pairs_file
 from apex_ompl.robot.model import Robot
 from apex_ompl.robot.self_collision import SelfCollision, are_neighbors
 from apex_ompl.scene.meshes import triangles, weld
@@ -17,14 +20,28 @@ Pair = tuple[int, int]
 FINEST = 1e-4  # distance below which no proof is tried [m]
 MOST_INTERVALS = 4000  # of the range of a joint
 SWEEP = 1001  # values of a joint at which contacts are looked for
-GRAZE = 5e-4  # by which both shapes are taken in for contacts that bearings have [m]
+GRAZING = "adjacent, contacts shallower than"  # beginning of the reason of pairs that do touch
+
+Links = tuple[str, str]
 
 
-def reason_of_neighbors(robot: Robot, pair: Pair) -> str:
+def grazing_links(file: Path | None) -> tuple[Links, ...]:
+    """Return the pairs of links in a file of disabled pairs that touch as bearings do; none without a file.
+
+    Raises:
+        MissingFileError: It cannot be read.
+        FileFormatError: It does not follow the schema.
+    """
+    pairs = () if file is None else read_disabled_pairs_file(file).pairs
+    return tuple(pair.links for pair in pairs if pair.reason.startswith(GRAZING))
+
+
+def reason_of_neighbors(robot: Robot, pair: Pair, graze: float) -> str:
     """Return why a pair of geometries with one planned joint between them is not checked, or an empty string.
 
     It is proved apart over the range of the joint; or, at ``SWEEP`` values over it, it is free, or would be if the
-    surfaces of both meshes were ``GRAZE`` further inside. Such contacts are those of bearings, not of motions.
+    surfaces of both meshes were half of ``graze`` [m] further inside. Such contacts are those of bearings, not of
+    motions.
     """
     joint = _joint_between(robot, pair)
     if not joint:
@@ -38,12 +55,12 @@ def reason_of_neighbors(robot: Robot, pair: Pair) -> str:
     if not SelfCollision(robot, [pair]).hits(states).any():
         return f"never, at {SWEEP} values over the range of {joint}"
     items = [robot.geometry.geometryObjects[geometry].geometry for geometry in pair]
-    if not all(is_shell(shape) for shape in items):
+    if not graze or not all(is_shell(shape) for shape in items):
         return ""
-    inner = {geometry: taken_in(shape, GRAZE) for geometry, shape in zip(pair, items, strict=True)}
+    inner = {geometry: taken_in(shape, graze / 2.0) for geometry, shape in zip(pair, items, strict=True)}
     if SelfCollision(robot, [pair], inner).hits(states).any():
         return ""
-    return f"adjacent, contacts shallower than {2e3 * GRAZE:.0f} mm at {SWEEP} values over the range of {joint}"
+    return f"{GRAZING} {1e3 * graze:g} mm at {SWEEP} values over the range of {joint}"
 
 
 def taken_in(mesh: coal.BVHModelBase, depth: float) -> coal.BVHModelBase:

@@ -6,7 +6,7 @@ and its own arm), never one arm against the other. Three findings disable a pair
 - by design: both links belong to a soft part, a hand whose fingers touch each other and the palm as its synergy closes;
 - always: in collision at every random state;
 - never: free at every random state, and still ``margin`` apart at the closest state that a local search finds; or, with
-  one joint between them, apart over its whole range, or in contact as bearings are
+  one joint between them, apart over its whole range, or in contact as bearings are, nowhere deeper than ``graze``
   (:mod:`apex_ompl.collision.cover.neighbors`).
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 from apex_ompl.collision.cover.neighbors import reason_of_neighbors
 from apex_ompl.collision.hulls import convex_hull
 from apex_ompl.collision.links import Links
-from apex_ompl.errors import UnknownNameError
+from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.robot.config import RobotConfig
 from apex_ompl.robot.model import Robot, link_of
 from apex_ompl.robot.self_collision import ALWAYS, SelfCollision, enabled_pairs, links_of_pair
@@ -37,6 +37,7 @@ FAR = 0.3  # ... nearer than this; else it starts from one [m]
 DISTANCES = 2000  # states at which distances are measured
 STEPS = 60  # of a local search
 SWEEP = 1001  # positions of the synergies of soft parts
+GRAZE, MOST_GRAZE = 1e-3, 1e-2  # depth of contacts of bearings, and most that may be allowed [m]
 
 
 @dataclass(frozen=True)
@@ -48,18 +49,22 @@ class PairSearch:
         margin: Least distance of a pair that never touches [m].
         seed: Of the states.
         soft: Parts whose links may touch each other.
+        graze: Depth to which links with one joint between them may touch over its whole range; 0 for not at all [m].
     """
 
     samples: int = 20_000
     margin: float = 0.02
     seed: int = 0
     soft: tuple[str, ...] = ()
+    graze: float = GRAZE
 
     def __post_init__(self) -> None:
         """Check the ranges."""
         check_integer(self.samples, "samples", 1)
         check_positive(self.margin, "margin", "a positive distance [m]")
         check_seed(self.seed)
+        if not 0.0 <= self.graze <= MOST_GRAZE:
+            raise ParameterError("graze", self.graze, f"0 to {MOST_GRAZE:g} m")
 
 
 def disabled_pairs(
@@ -172,7 +177,9 @@ def _decide(
         for pair, count in zip(pairs, counts, strict=True)
         if count >= enough
     }
-    reasons |= {pair: why for pair in pairs if pair not in reasons and (why := reason_of_neighbors(robot, pair))}
+    reasons |= {
+        pair: why for pair in pairs if pair not in reasons and (why := reason_of_neighbors(robot, pair, search.graze))
+    }
     untouched = [pair for pair, count in zip(pairs, counts, strict=True) if count == 0]
     left = [pair for pair in untouched if pair not in reasons]
     done = first

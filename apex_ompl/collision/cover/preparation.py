@@ -22,7 +22,8 @@ import numpy as np
 
 from apex_ompl.collision.checker import CollisionChecker
 from apex_ompl.collision.clearance_making import TableReport, prepare_clearances
-from apex_ompl.collision.cover.pairs import PairSearch, disabled_pairs
+from apex_ompl.collision.cover.neighbors import grazing_links
+from apex_ompl.collision.cover.pairs import GRAZE, PairSearch, disabled_pairs
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.spheres import FULL, make_cover, read_covers, read_efforts, shape_key, write_covers
 from apex_ompl.collision.cover.survey import proved_share
@@ -68,6 +69,7 @@ class Prepared(NamedTuple):
 
     Attributes:
         pairs: Pairs of links in the file of disabled pairs.
+        grazing: Those of them that touch as bearings do, and are not checked for that.
         covers: Effort -> number of shapes whose covers were made by it, in all runs.
         missing: Shapes without a cover in the file.
         thorough: Whether nothing is left to do.
@@ -75,6 +77,7 @@ class Prepared(NamedTuple):
     """
 
     pairs: int
+    grazing: tuple[tuple[str, str], ...]
     covers: dict[int, int]
     missing: int
     thorough: bool
@@ -124,7 +127,7 @@ def prepare(path: Path, settings: Preparation | None = None, report: Report = la
     efforts = [covers.efforts.get(key, 0) for key in covers.shapes]
     numbers = {effort: efforts.count(effort) for effort in sorted({*efforts} - {0})}
     thorough = complete and min(efforts, default=FULL) >= settings.effort
-    return Prepared(count, numbers, covers.missing, thorough, tuple(files))
+    return Prepared(count, grazing_links(pairs_file), numbers, covers.missing, thorough, tuple(files))
 
 
 def _prepare_tables(robot: Robot, deadline: float, report: Report) -> list[Path]:
@@ -151,6 +154,7 @@ def _prepare_pairs(
     search, deadline = settings.pairs, time.monotonic() + PAIRS_SHARE * settings.budget
     command = f"{COMMAND} --samples {search.samples} --margin {search.margin:g} --seed {search.seed}"
     command += "".join(f" --soft {part}" for part in search.soft)
+    command += f" --graze {search.graze:g}" if search.graze != GRAZE else ""
     known = read_disabled_pairs_file(file) if file.exists() else None
     if known is not None and known.command == command and known.robot == digest(robot):
         return len(known.pairs), True

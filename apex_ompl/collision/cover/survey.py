@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision.checker import CollisionChecker
+from apex_ompl.collision.cover.neighbors import grazing_links
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.robot.self_collision import SelfCollision, shares_by_links
@@ -39,6 +40,7 @@ class Survey(NamedTuple):
         spoilers: Pair of links -> share of the free states at which it is not proved apart, largest first.
         always: Pairs of links that touch at all of ``pair_samples`` states.
         never: Pairs that are checked and touch at none of them.
+        grazing: Pairs that are not checked although they touch, as bearings do, by what ``robot prepare`` allows.
         pair_samples: Number of states for the pairs.
         home: The reason for which the home is not free, or an empty string.
         open_meshes: Links with meshes that are not watertight.
@@ -51,6 +53,7 @@ class Survey(NamedTuple):
     spoilers: dict[Links, float]
     always: tuple[Links, ...]
     never: tuple[Links, ...]
+    grazing: tuple[Links, ...]
     pair_samples: int
     home: str
     open_meshes: tuple[str, ...]
@@ -84,7 +87,7 @@ def survey(robot: Robot, samples: int = SAMPLES, seed: int = 0) -> Survey:
         samples, len(free) / samples, proved, spoilers,
         tuple(links for links, share in shares.items() if share == 1.0),
         tuple(links for links, share in shares.items() if share == 0.0),
-        len(chosen), home, open_meshes(robot), unlimited_joints(robot),
+        grazing_links(robot.disabled_pairs), len(chosen), home, open_meshes(robot), unlimited_joints(robot),
     )  # fmt: skip
 
 
