@@ -51,6 +51,7 @@ FOLLOWER_ARMATURE, FOLLOWER_DAMPING = 1e-4, 5e-3  # of joints that mimic others
 FINGER_DAMPING = 0.01  # of the springs by which fingers yield [Nm s/rad]
 SOFT_CONTACT = {"solref": [0.004, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
 SOLIDS, FALLING = 1, 2  # bits by which geoms collide: the floor is touched by held objects only
+GONE = 8  # by how much these bits are shifted of bodies that are gone
 AWAY = np.array([0.0, 0.0, -1000.0])  # where obstacles are that have not appeared [m]
 COLORS = {
     "link": (0.85, 0.86, 0.88, 1.0), "fixture": (0.79, 0.65, 0.49, 1.0), "obstacle": (0.78, 0.33, 0.24, 1.0),
@@ -140,6 +141,22 @@ class Twin:
         self._mj.mju_mulPose(offset, turn, place, inverse, body.xpos, body.xquat)
         equality.data[3:10] = [*offset, *turn]
         data.eq_active[equality.id] = active
+
+    def remove(self, name: str, gone: bool = True) -> None:
+        """Let a body touch nothing, without weight and unseen, or bring it back.
+
+        Raises:
+            UnknownNameError: There is no such body.
+        """
+        check_name(name, "body", self.names)
+        model, body = self.model, self.model.body(name).id
+        mine = model.geom_bodyid == body
+        for bits in (model.geom_contype, model.geom_conaffinity):  # those of a body that is gone are shifted up
+            bits[mine] = bits[mine] << GONE if gone else bits[mine] >> GONE
+        for bits in (model.body_contype, model.body_conaffinity):
+            bits[body] = bits[body] << GONE if gone else bits[body] >> GONE
+        model.geom_rgba[mine, 3] = 0.0 if gone else 1.0
+        model.body_gravcomp[body] = 1.0 if gone else 0.0
 
     def grip(self, data: Any, hand: str, closed: bool) -> None:
         """Close or open the jaws of a hand, where fingers yield; a hand without jaws stays as it is."""

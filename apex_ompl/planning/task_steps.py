@@ -25,7 +25,6 @@ from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
 from apex_ompl.scene.steps import (
-    AllowStep,
     AttachStep,
     DetachStep,
     GraspStep,
@@ -33,6 +32,7 @@ from apex_ompl.scene.steps import (
     LineStep,
     ReleaseStep,
     RetreatStep,
+    SceneStep,
     TogetherStep,
     TurnStep,
     WaitStep,
@@ -157,7 +157,7 @@ class StepPlanner:
             return self._line(world, step, q, timing)
         if isinstance(step, TogetherStep):
             return self._together(world, step, q, timing)
-        if isinstance(step, AttachStep | DetachStep | AllowStep):
+        if isinstance(step, AttachStep | DetachStep | SceneStep):
             during = world if isinstance(step, DetachStep) else world.after(step, q)
             return self._proved(StepPlan(step, during, world.after(step, q), Path(q[None]), None, nan), timing)
         assert not isinstance(step, MoveStep)

@@ -311,6 +311,40 @@ class AllowStep(Step):
         return pairs if self.contact else f"{pairs} no longer"
 
 
+class RemoveStep(Step):
+    """Obstacles or fixtures of the robot are gone from now on.
+
+    Attributes:
+        objects: Their names.
+    """
+
+    kind: Literal["remove"] = "remove"
+    objects: Names
+
+    @property
+    def subject(self) -> str:
+        """The objects."""
+        return " and ".join(self.objects)
+
+
+class AddStep(Step):
+    """Obstacles or fixtures that a step removed are back where they were, from now on.
+
+    Attributes:
+        objects: Their names.
+    """
+
+    kind: Literal["add"] = "add"
+    objects: Names
+
+    @property
+    def subject(self) -> str:
+        """The objects."""
+        return " and ".join(self.objects)
+
+
+SceneStep = AllowStep | RemoveStep | AddStep
+"""A step that changes what the robot may touch; nothing moves."""
 SimultaneousStep = (
     LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep | AttachStep | DetachStep
 )
