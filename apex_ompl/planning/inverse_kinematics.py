@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.tables import with_range
 from apex_ompl.constraints.links import Links
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import within
@@ -249,7 +250,7 @@ class _Part:
         free, missed = self.inverse.free, missed[:BLAMED]
         lower, upper = self.robot.limits.lower.copy(), self.robot.limits.upper.copy()
         lower[free], upper[free] = -2.0 * np.pi, 2.0 * np.pi
-        wide = replace(self.robot, limits=replace(self.robot.limits, lower=lower, upper=upper))
+        wide = with_range(self.robot, lower, upper)
         ends = (
             Links(wide)
             .inverse(self.goal.targets(), self.stays)

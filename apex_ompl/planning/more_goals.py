@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from apex_ompl.collision.tables import with_range
 from apex_ompl.goals.goal_sampling import GoalSet, WorkspaceGoal, sample
 from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, workspace_goal
 from apex_ompl.types import Array
@@ -15,8 +16,7 @@ def sampled_goal(setup: PlanningSetup) -> WorkspaceGoal | GoalSet | None:
     """Return the goal of a problem that is given in the workspace, for the joints that are planned, or None."""
     robot = setup.robot
     if len(setup.held):
-        lower, upper = setup.bounds
-        robot = replace(robot, limits=replace(robot.limits, lower=lower, upper=upper))
+        robot = with_range(robot, *setup.bounds)
     return workspace_goal(robot, setup.problem)
 
 
