@@ -252,6 +252,16 @@ class CollisionChecker(SceneBodies):
             return proof.clearance
         return -max((contact.depth for contact in self.contacts(q)), default=0.0)
 
+    def clearances(self, states: Array) -> Array:
+        """Return :meth:`clearance` at states, shape (N, dof), faster where they are free; shape (N,) [m]."""
+        states = number_array(states, "states")
+        check_states(states, self.robot.dof, "states", least=0)
+        free = self.are_free(states)
+        found = np.empty(len(states))
+        found[free] = self._prover.clearances(self.kernel, states[free])
+        found[~free] = [self.clearance(q) for q in states[~free]]
+        return found
+
     def _is_free_given(self, q: Array, unproved: UnprovedPairs | None = None) -> bool:
         """Whether a state is free, given the pairs that the balls did not prove.
 

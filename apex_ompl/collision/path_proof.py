@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from weakref import WeakKeyDictionary
 
@@ -213,15 +213,11 @@ class PathProver:
         """
         if not (np.isfinite(curve.states).all() and np.isfinite(curve.rates).all()):
             return PathProof.refused("a state that is not finite", curve)
-        proof, shapes = self._proof(kernel), self._shapes(kernel)
-        for limit in self._limits(kernel, curve) if tolerance > 0.0 else (0.0,):
-            proof.start(kernel, shapes, curve, limit)
-            outcome, over = MORE, False
-            while outcome == MORE and not over:
-                outcome = proof.advance(touch, tolerance, BUDGET)
-                over = outcome == MORE and deadline is not None and time.perf_counter() > deadline
-            if over or outcome != PROVED or proof.figures.least <= limit:
-                break
+        limits: Iterable[float] = (0.0,)
+        if tolerance > 0.0:
+            places = distinct(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
+            limits = _limits(np.nanmin(kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
+        proof, outcome, over = self._run(kernel, curve, limits, (touch, tolerance), deadline)
         margin, least, where, by_spheres = proof.figures
         names, ok = self._names(kernel, *proof.pair), outcome == PROVED
         reason, length = "", float(curve.knots[-1] - curve.knots[0])
@@ -237,16 +233,44 @@ class PathProver:
         bound = margin if ok and tolerance > 0.0 else 0.0
         return PathProof(ok, reason, where, proof.state, least, bound, names, share, proof.intervals, over)
 
-    @staticmethod
-    def _limits(kernel: Kernel, curve: Curve) -> Iterator[float]:
-        """Yield limits of the clearance that is looked for [m], from that of the spheres at some states."""
-        places = distinct(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
-        near = float(np.nanmin(kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
-        limit = max(near + SLACK, SLACK)
-        while limit < MOST_LIMIT:
-            yield limit
-            limit *= 2.0
-        yield np.inf
+    def clearances(self, kernel: Kernel, states: Array) -> Array:
+        """Return the distances of the nearest pairs at states that are free, shape (N,) [m].
+
+        Args:
+            kernel: The kernel of the scene as it is now.
+            states: The states, shape (N, dof).
+        """
+        found, still = np.empty(len(states)), np.empty((0, 2 * states.shape[1]))
+        near = np.nan_to_num(kernel.clearance(states, MOST_LIMIT).min(axis=1), nan=MOST_LIMIT)
+        for k, q in enumerate(states):
+            curve = Curve(np.zeros(2), np.stack([q, q]), still, 0.0)
+            proof, _, _ = self._run(kernel, curve, _limits(float(near[k])), (TOUCH, TOLERANCE))
+            found[k] = proof.figures.least
+        return found
+
+    def _run(
+        self, kernel: Kernel, curve: Curve, limits: Iterable[float], bounds: tuple[float, float],
+        deadline: float | None = None,
+    ) -> tuple[CurveProof, int, bool]:  # fmt: skip
+        """Return a proof at its end, its outcome, and whether the deadline passed before.
+
+        Args:
+            kernel: The kernel.
+            curve: The curve.
+            limits: Clearances above which none is looked for, in turn, until one is found [m].
+            bounds: Distance that counts as contact, and tolerance of the clearance [m].
+            deadline: As of :meth:`prove`.
+        """
+        proof, shapes = self._proof(kernel), self._shapes(kernel)
+        for limit in limits:
+            proof.start(kernel, shapes, curve, limit)
+            outcome, over = MORE, False
+            while outcome == MORE and not over:
+                outcome = proof.advance(*bounds, BUDGET)
+                over = outcome == MORE and deadline is not None and time.perf_counter() > deadline
+            if over or outcome != PROVED or proof.figures.least <= limit:
+                break
+        return proof, outcome, over
 
     def _names(self, kernel: Kernel, first: int, second: int) -> tuple[str, str]:
         if first < 0:
@@ -260,6 +284,15 @@ class PathProver:
         if proof is None or proof.robot is not kernel.robot:
             proof = self._local.proof = CurveProof(kernel)
         return proof
+
+
+def _limits(near: float) -> Iterator[float]:
+    """Yield limits of the clearance that is looked for, from that of the spheres, which cover more [m]."""
+    near, slack = max(near, 0.0), SLACK
+    while near + slack < MOST_LIMIT:
+        yield near + slack
+        slack *= 2.0
+    yield np.inf
 
 
 def changed_obstacles(before: Kernel, now: Kernel) -> Flags | None:

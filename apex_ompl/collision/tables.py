@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -70,6 +71,13 @@ def joint_tree(robot: Robot) -> JointTree:
         RobotError: The motion of a joint is not that of a constant twist about or along an axis.
     """
     return JointTree(joint_specs(robot), np.flatnonzero(robot.continuous).tolist())
+
+
+def with_range(robot: Robot, lower: Array, upper: Array) -> Robot:
+    """Return a robot with other positions of limits, shape (dof,) each, which shares its tree of joints."""
+    other = replace(robot, limits=replace(robot.limits, lower=lower, upper=upper))
+    joint_tree.keep(other, joint_tree(robot))
+    return other
 
 
 def joint_specs(robot: Robot) -> list[JointSpec]:

@@ -3,6 +3,7 @@
 The synergy of a hand is commanded beyond the first contact with an object; its fingers are springs that yield, and the
 torque of the synergy is limited. While a hand closes on an object that no other one holds, a weld without weight guides
 it. An object that two links of a hand press on may then be welded to its palm; the weld yields a little, as fingers do.
+Grippers with jaws close on what stands somewhere without any help, and hold it by friction alone.
 An object that two hands hold at once, as the ends of a tray, is welded to both palms, whether they touch it or not, and
 one that a link without a hand holds to that link.
 """
@@ -94,24 +95,25 @@ class Grasps:
                 driver.twin.weld(driver.data, one.name, one.link)
 
     def grasp(self, name: str, hand: str, advance: Callable[[float], None] | None = None) -> None:
-        """Close a hand on an object that another one holds, or that stands somewhere, and weld it.
+        """Close a hand on an object that another one holds, or that stands somewhere, and weld it, but for jaws.
 
         Args:
             name: The object.
             hand: The hand.
             advance: Simulates up to a time [s], by default ``driver.advance``.
         """
+        jaws = bool(self.driver.robot.hands[hand].jaws)
         stands = [one.model_copy(update={"link": self._palm(hand)}) for one in self._objects.values()
-                  if one.name == name and name in self._standing]  # fmt: skip
+                  if one.name == name and name in self._standing and not jaws]  # fmt: skip
         with _Guide(self.driver, stands, ()):
             self._press({hand})
             (advance or self.driver.advance)(self.driver.time + CLOSING)
-        self._hold(name, hand, WELD)
+        self._hold(name, hand, FRICTION if jaws else WELD)
         self._standing.discard(name)
 
     def open(self, hand: str) -> None:
         """Take the pressure from a hand that is about to open."""
-        self.driver.press(self._synergy(hand), 0.0)
+        self._press({hand}, 0.0)
 
     def release(
         self, names: Collection[str], hand: str, advance: Callable[[float], None] | None = None
@@ -144,15 +146,15 @@ class Grasps:
             twin.model.eq_solref[weld], twin.model.eq_solimp[weld, :2] = YIELDING
         self.found.append(GraspFound(name, hand, kind, pressing, sum(forces[link] for link in pressing)))
 
-    def _press(self, hands: Collection[str]) -> None:
+    def _press(self, hands: Collection[str], by: float = SQUEEZE) -> None:
         for hand in hands:
-            self.driver.press(self._synergy(hand), SQUEEZE)
+            synergy = self.driver.robot.hands[hand].synergy
+            if synergy is not None:
+                self.driver.press(synergy, by)
+            self.driver.grip(hand, by > 0.0)
 
     def _palm(self, hand: str) -> str:
         return self.driver.robot.hands[hand].palm
-
-    def _synergy(self, hand: str) -> str:
-        return str(self.driver.robot.hands[hand].synergy)
 
 
 class _Guide:

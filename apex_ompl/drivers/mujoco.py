@@ -159,6 +159,15 @@ class MujocoDriver:
         check_number(by, "by", 0.0, 1.0)
         self._press[self.names.index(joint)] = by
 
+    def grip(self, hand: str, closed: bool = True) -> None:
+        """Close the jaws of a gripper by its force, or open them; other hands do not move.
+
+        Raises:
+            UnknownNameError: There is no such hand.
+        """
+        check_name(hand, "hand", self.robot.hands)
+        self.twin.grip(self.data, hand, closed)
+
     @property
     def fault(self) -> str:
         """Why the driver stopped, in a sentence; else empty."""

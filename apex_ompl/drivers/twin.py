@@ -23,6 +23,7 @@ import pinocchio as pin
 from apex_ompl.collision.mass import held_load
 from apex_ompl.collision.shapes import coal_geometry
 from apex_ompl.drivers.geoms import geom_shapes
+from apex_ompl.drivers.jaws import RIGID, add_jaws, set_jaws
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.drivers.twin_settings import (
     LEADER_ARMATURE,
@@ -49,8 +50,8 @@ from apex_ompl.util.validation import check_name
 FOLLOWER_ARMATURE, FOLLOWER_DAMPING = 1e-4, 5e-3  # of joints that mimic others
 FINGER_DAMPING = 0.01  # of the springs by which fingers yield [Nm s/rad]
 SOFT_CONTACT = {"solref": [0.004, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
-RIGID = {"solref": [0.002, 1.0], "solimp": [0.99, 0.999, 0.001, 0.5, 2.0]}  # of mimic joints and welds
 SOLIDS, FALLING = 1, 2  # bits by which geoms collide: the floor is touched by held objects only
+GONE = 8  # by how much these bits are shifted of bodies that are gone
 AWAY = np.array([0.0, 0.0, -1000.0])  # where obstacles are that have not appeared [m]
 COLORS = {
     "link": (0.85, 0.86, 0.88, 1.0), "fixture": (0.79, 0.65, 0.49, 1.0), "obstacle": (0.78, 0.33, 0.24, 1.0),
@@ -141,6 +142,27 @@ class Twin:
         equality.data[3:10] = [*offset, *turn]
         data.eq_active[equality.id] = active
 
+    def remove(self, name: str, gone: bool = True) -> None:
+        """Let a body touch nothing, without weight and unseen, or bring it back.
+
+        Raises:
+            UnknownNameError: There is no such body.
+        """
+        check_name(name, "body", self.names)
+        model, body = self.model, self.model.body(name).id
+        mine = model.geom_bodyid == body
+        for bits in (model.geom_contype, model.geom_conaffinity):  # those of a body that is gone are shifted up
+            bits[mine] = bits[mine] << GONE if gone else bits[mine] >> GONE
+        for bits in (model.body_contype, model.body_conaffinity):
+            bits[body] = bits[body] << GONE if gone else bits[body] >> GONE
+        model.geom_rgba[mine, 3] = 0.0 if gone else 1.0
+        model.body_gravcomp[body] = 1.0 if gone else 0.0
+
+    def grip(self, data: Any, hand: str, closed: bool) -> None:
+        """Close or open the jaws of a hand, where fingers yield; a hand without jaws stays as it is."""
+        if self.yields:
+            set_jaws(self.model, data, self.robot, hand, closed)
+
     def forces(self, data: Any, name: str) -> dict[str, Array]:
         """Return the forces of other bodies on a body by their names, in the world, each of shape (3,) [N]."""
         found: dict[str, Array] = {}
@@ -183,6 +205,8 @@ class Twin:
         data.time, data.qvel[:] = time, 0.0
         data.qpos[self.q], data.ctrl[self.u] = state, 0.0
         data.qpos[self._followers] = self._line[:, 0] * data.qpos[self._leaders] + self._line[:, 1]
+        for hand in self.robot.hands:
+            self.grip(data, hand, False)
         for one in self.held:
             self._set_free(data, one.name, self.robot.link_pose(state, one.link) @ one.pose)
         self.move_obstacles(data, time)
@@ -247,6 +271,7 @@ class Twin:
         spec = self._skeleton()
         self._add_links(spec)
         self._add_joints(spec)
+        coupled = add_jaws(self._mj, spec, self.robot) if self.yields else 0
         for fixture in self.robot.fixtures:
             self._add_static(spec, fixture, "fixture")
         for obstacle in scene:
@@ -263,7 +288,7 @@ class Twin:
             reason = " ".join(str(error).split())
             raise RobotError(f"MuJoCo cannot make a model of {self.robot.name} ({reason})") from error
         joints = int(np.sum(model.eq_type == self._mj.mjtEq.mjEQ_JOINT)) + model.ntendon
-        if joints != len(self.mimics):
+        if joints - coupled != len(self.mimics):
             raise RobotError(f"MuJoCo has {joints} equalities for the {len(self.mimics)} mimic joints of the URDF")
         return model
 

@@ -219,3 +219,13 @@ def alignment_goal(robot: Robot, problem: Problem) -> AlignmentGoal | None:
     if problem.goal.alignment is None:
         return None
     return AlignmentGoal(robot, problem.goal.alignment, problem.attached, problem.start_state(robot.joint_names))
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of an error term."""
+    return "m" if name in ("lateral", "axial") or name.startswith("position") else "rad"
+
+
+def relative_error(errors: Mapping[str, float], bounds: Mapping[str, float]) -> float:
+    """Return the largest ratio of an error to its bound, where a bound of zero counts as 0.01."""
+    return max(value / max(bounds[name], 0.01) for name, value in errors.items())

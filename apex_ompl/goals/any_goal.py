@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.goals import goal_sampling as single
-from apex_ompl.goals.alignment import AlignmentGoal, within
+from apex_ompl.goals.alignment import AlignmentGoal, relative_error, within
 from apex_ompl.goals.goal_sampling import GoalSamples
 from apex_ompl.goals.pose_goal import PoseGoal
 from apex_ompl.robot import Robot
@@ -85,7 +85,7 @@ class AnyGoal:
             if not least:
                 break
             errors, bounds = goal.errors(q), goal.bounds
-            least = 0.0 if within(errors, bounds) else min(least, single.relative_error(errors, bounds))
+            least = 0.0 if within(errors, bounds) else min(least, relative_error(errors, bounds))
         return {ANY: least}
 
     def nearest_states(self, checker: CollisionChecker, rng: np.random.Generator, count: int) -> Array:
@@ -132,7 +132,13 @@ class AnyGoal:
             return GoalSamples(states, attempts, converged, {}, "")
         blocked = next((one.blocked for one in found if one.blocked), first.blocked)
         best = min((one.best for one in found), key=lambda best: max(best.values()), default={})
-        return GoalSamples(states, attempts, converged, best, blocked)
+        hint = next((one.hint for one in found if one.hint), "")
+        return GoalSamples(states, attempts, converged, best, blocked, hint, "" if converged else self._out_of_reach())
+
+    def _out_of_reach(self) -> str:
+        """Return why no goal can be reached, where that is shown of all, or nothing."""
+        shown = [goal.out_of_reach() if isinstance(goal, PoseGoal) else "" for goal in self.members]
+        return shown[0] if shown and all(shown) and not len(self.states) else ""
 
     def sample_on(
         self, constraints: ConstraintSet, checker: CollisionChecker, rng: np.random.Generator, count: int = 8,

@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.goals.alignment import within
+from apex_ompl.goals.alignment import relative_error, unit_of, within
 from apex_ompl.kernel import IKDescents, IKSolver
 from apex_ompl.robot import Robot
 from apex_ompl.robot.rest_to_rest import direct_durations, direct_reach
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import distinct
+from apex_ompl.util.display import counted
 
 if TYPE_CHECKING:
     from apex_ompl.constraints.constraint_set import ConstraintSet
@@ -88,7 +89,10 @@ class WorkspaceGoal(Protocol):
 
 @runtime_checkable
 class Hinting(Protocol):
-    """A goal that may tell what is meant where it is out of reach."""
+    """A goal that may tell why it is out of reach, and what is meant."""
+
+    def out_of_reach(self) -> str:
+        """Return why no state reaches it, where that is shown, or nothing."""
 
     def hint(self) -> str:
         """Return as what it may be meant, or nothing."""
@@ -121,6 +125,7 @@ class GoalSamples:
         best: Error terms of the best attempt.
         blocked: A collision of the last state that reached the goal; empty if one was free or none reached it.
         hint: As what a goal that was not reached may be meant, or nothing.
+        far: Why no state reaches the goal, where that is shown, or nothing.
     """
 
     states: Array
@@ -129,21 +134,22 @@ class GoalSamples:
     best: Mapping[str, float]
     blocked: str
     hint: str = ""
+    far: str = ""
 
     @property
     def fault(self) -> str:
         """Reason for which there is no state, in one sentence; empty when there is one."""
         if len(self.states):
             return ""
+        tried = counted(self.attempts, "descent")
         if not self.attempts and not self.converged:
             return "none of the goal states is inside the limits and leaves the joints that are not planned as they are"
         if ON_CONSTRAINTS in self.best:
-            return f"no state at the goal on the constraints was found in {self.attempts} attempts"
+            return f"none on the constraints found in {tried}"
         if self.converged:
-            return f"all {self.converged} states found at the goal in {self.attempts} attempts collide, {self.blocked}"
+            return f"none found in {tried}: all {counted(self.converged, 'state')} at the goal collide, {self.blocked}"
         best = ", ".join(f"{name} {value:.3g} {unit_of(name)} off" for name, value in self.best.items())
-        hint = f"; {self.hint}" if self.hint else ""
-        return f"not reached in {self.attempts} attempts; the best has {best}{hint}"
+        return "; ".join(filter(None, [self.far or f"none found in {tried}; the best has {best}", self.hint]))
 
 
 def sample(
@@ -181,8 +187,10 @@ def sample(
         converged = 0
     if search.colliding is not None and not len(states):
         blocked = str(next(iter(checker.contacts(search.colliding)), "in collision"))
-    hint = goal.hint() if isinstance(goal, Hinting) and not len(states) and not converged else ""
-    return GoalSamples(states, search.attempts, converged, search.errors, blocked, hint)
+    hint = far = ""
+    if isinstance(goal, Hinting) and not len(states) and not converged:
+        hint, far = goal.hint(), goal.out_of_reach()
+    return GoalSamples(states, search.attempts, converged, search.errors, blocked, hint, far)
 
 
 def sample_on_constraints(
@@ -482,13 +490,3 @@ def _closeness(clearances: Array) -> Array:
     near = (KEPT_CLEAR - clearances).max(axis=1, initial=0.0)
     factors: Array = 1.0 + CLOSE * np.minimum(near / KEPT_CLEAR, 1.0)
     return factors
-
-
-def unit_of(name: str) -> str:
-    """Return the unit of an error term."""
-    return "m" if name in ("lateral", "axial") or name.startswith("position") else "rad"
-
-
-def relative_error(errors: Mapping[str, float], bounds: Mapping[str, float]) -> float:
-    """Return the largest ratio of an error to its bound, where a bound of zero counts as 0.01."""
-    return max(value / max(bounds[name], 0.01) for name, value in errors.items())

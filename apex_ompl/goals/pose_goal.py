@@ -11,6 +11,7 @@ from apex_ompl.constraints.frames import Frame, frame_of
 from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import angle, within
+from apex_ompl.goals.reach import too_far
 from apex_ompl.kernel import Target, offset_target, opposition_target
 from apex_ompl.kernel.products import product
 from apex_ompl.robot import Robot
@@ -112,6 +113,16 @@ class PoseGoal:
                 axis = links.direction(frame.link, frame.pose[:3, k])
                 targets.append(opposition_target(axis, in_world(wanted[:, k]), -1.0))
         return targets
+
+    def out_of_reach(self, base: Array | None = None) -> str:
+        """Return why a pose is farther away than the arm is long, or nothing where that is not shown.
+
+        Args:
+            base: Values of the joints that do not move, shape (dof,), by default those of the start.
+        """
+        at, free = self.start if base is None else base, self.inverse.free
+        faults = (too_far(self.robot, *one, at, free) for one in zip(self.poses, self.frames, strict=True))
+        return next(filter(None, faults), "")
 
     def hint(self) -> str:
         """Return as what poses that are out of reach may be meant, if they can be reached as that; else nothing."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, TypeVar, cast
 
@@ -243,6 +244,7 @@ class JointTree:
             self.placements.append(product(product(self.turns[joint.parent].T, placement), self.turns[k]))
             self.chains.append([k, *self.chains[joint.parent]])
         drivers = [joint.source for joint in joints if joint.kind != FIXED]
+        self._below = Counter(joint.parent for joint in joints[1:])
         self._shared = {source for source in drivers if drivers.count(source) > 1 and source not in endless}
         self._fingers = [self._is_finger(k) for k in range(len(joints))]
         self.home = [self._cluster_joint(k) for k in range(len(joints))]
@@ -272,8 +274,7 @@ class JointTree:
     def branch(self, joint: int, top: int) -> int:
         """Return the joint below ``top`` that a joint is or hangs at; ``top`` itself, too, where there are many."""
         chain = self.chains[joint]
-        below = sum(one.parent == top for one in self.joints[1:])
-        return top if below >= MOST_PARTS else chain[max(chain.index(top) - 1, 0)]
+        return top if self._below[top] >= MOST_PARTS else chain[max(chain.index(top) - 1, 0)]
 
     def outer_radii(self, centers: Array, body: BodySpec) -> Array:
         """Return the radii of :func:`apex_ompl.kernel.cluster_balls.leaf_radii`, shape (n,); they are kept."""

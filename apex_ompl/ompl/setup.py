@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 from typing import TYPE_CHECKING
 from weakref import ref
@@ -14,6 +14,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.tables import with_range
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import AlignmentGoal, alignment_goal
 from apex_ompl.goals.any_goal import AnyGoal
@@ -138,8 +139,7 @@ def assemble(
     held = np.array([k for k, name in enumerate(names) if moving is not None and name not in moving], np.intp)
     start, goals, notes = _ends(problem, robot, held)
     lower, upper = bounds = _bounds(robot, start, held)
-    limits = replace(robot.limits, lower=lower, upper=upper)
-    sampled = workspace_goal(replace(robot, limits=limits) if len(held) else robot, problem)
+    sampled = workspace_goal(with_range(robot, lower, upper) if len(held) else robot, problem)
     if checker is None:
         now = problem_at(problem, 0.0)
         checker = CollisionChecker(robot, now.scene, now.attached, now.allowed)

@@ -23,7 +23,7 @@ from apex_ompl.planning.task_result import TaskResult, TaskStep
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import GraspStep, ReleaseStep, Step, TogetherStep
+from apex_ompl.scene.steps import AddStep, GraspStep, ReleaseStep, RemoveStep, Step, TogetherStep
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -157,6 +157,8 @@ class Executor:
         for one in parts:
             if isinstance(one, ReleaseStep):
                 self.grasps.open(one.hand)
+            for name in one.objects if isinstance(one, RemoveStep | AddStep) else ():
+                driver.twin.remove(name, isinstance(one, RemoveStep))
         if motion.duration > 0.0:
             driver.send(motion, max(driver.time, driver.end))
             self._to(driver.end)

@@ -14,7 +14,7 @@ from apex_ompl.drivers.vessels import filled
 from apex_ompl.errors import ParameterError
 from apex_ompl.physics.execution import Executor, motion_of, rehearsed
 from apex_ompl.physics.result import UNPLANNED, TaskRun
-from apex_ompl.physics.trials import Spread, draw
+from apex_ompl.physics.trials import Spread, draw, nominal
 from apex_ompl.planning.planner import MotionPlanner
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.robot import load_robot
@@ -134,6 +134,27 @@ class TaskRunner:
         axes = {one.name: one.contact.axis for one in problem.attached if one.contact is not None}
         full = [name for name in filled(problem) if name not in upright]
         return tuple(Upright(frame=name, axis=axes[name], angle=SPILLING) for name in full)
+
+
+def execute(plan: TaskResult, settings: TwinSettings = GRASPING) -> TaskRun:
+    """Execute a planned task or sequence in physics, from the start and with the objects that it was planned for.
+
+    Objects that a hand holds at the start are welded to it.
+
+    Args:
+        plan: The plan, with a motion.
+        settings: Settings of the model.
+
+    Raises:
+        ParameterError: The plan has no motion, or fingers do not yield.
+    """
+    if not plan or plan.trajectory is None:
+        raise ParameterError("plan", f"{plan.status}", "a task that was planned and timed")
+    runner = TaskRunner(plan.problem, settings=settings)
+    trial = nominal(runner.robot, plan.problem, settings.density)
+    executor = Executor(runner.robot, trial, friction=(), settings=settings)
+    executor.grasp()
+    return executor.run(plan)
 
 
 def unplanned(problem: Problem, seed: int | None, reason: str, outcome: str = UNPLANNED) -> TaskRun:

@@ -8,16 +8,15 @@ given in the workspace are sampled again.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from apex_ompl.apex.parameters import ApexParameters
-from apex_ompl.goals.goal_sampling import GoalSet, WorkspaceGoal, sample
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.search import ENOUGH, RESOLUTION, TreePair, shortcut
-from apex_ompl.ompl.setup import GOAL_ATTEMPTS, GOAL_STATES, PlanningSetup, assemble, workspace_goal
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.path import SEARCH_RESOLUTION, resample
+from apex_ompl.planning.more_goals import sampled_goal, with_more
 from apex_ompl.planning.query import goal_record
 from apex_ompl.planning.step_records import PlanQuery
 from apex_ompl.robot.model import Limits
@@ -109,11 +108,7 @@ class OtherPaths:
         setup = self.query.setup
         if self._goal is None:
             return
-        found = sample(self._goal, setup.checker, self._rng.spawn(1)[0], GOAL_STATES, GOAL_ATTEMPTS).states
-        found[:, setup.held] = setup.start[setup.held]
-        goals = np.concatenate([setup.valid_goals, found])
-        none = ("",) * len(goals)
-        self.query.setup = replace(setup, goals=goals, goal_faults=none, goals_off=none)
+        self.query.setup, found = with_more(setup, self._goal, self._rng.spawn(1)[0])
         for goal in self._sooner(found):
             yield np.stack([setup.start, goal])
 
@@ -195,12 +190,3 @@ class OtherPaths:
             if setup.checker.is_free(q):
                 return np.asarray(q)
         return None
-
-
-def sampled_goal(setup: PlanningSetup) -> WorkspaceGoal | GoalSet | None:
-    """Return the goal of a problem that is given in the workspace, for the joints that are planned, or None."""
-    robot = setup.robot
-    if len(setup.held):
-        lower, upper = setup.bounds
-        robot = replace(robot, limits=replace(robot.limits, lower=lower, upper=upper))
-    return workspace_goal(robot, setup.problem)

@@ -13,18 +13,17 @@ from dataclasses import dataclass, field, replace
 from typing import overload
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.constraints.frames import Frame
+from apex_ompl.collision.tables import with_range
 from apex_ompl.constraints.links import Links
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import within
 from apex_ompl.goals.pose_goal import pose_goals
 from apex_ompl.goals.self_motions import DESCENT_STEPS, EXACT, REACHED, SelfMotions, search
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, pose_matrix
+from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import PoseTarget
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import distinct
@@ -34,7 +33,6 @@ MOST_STATES = 4096  # of one arm, and of combinations of two
 WANTED_CLEARANCE = 0.3  # beyond which clearances by spheres are not told apart [m]
 DIGITS = 3  # of clearances that are told apart [m]
 BLAMED = 64  # states in collision, and descents, whose cause is determined
-ROUNDING = 1e-6  # by which a pose out of reach is farther than the arm is long [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +149,11 @@ def solve(
     distances = np.linalg.norm(states - base, axis=1)
     least = np.zeros(len(states)) if by_distance else checker.kernel.clearance(states, WANTED_CLEARANCE).min(axis=1)
     best = np.lexsort([distances, -np.round(least, DIGITS)])[:count]
-    solutions = [IKSolution(states[k], checker.clearance(states[k]), distances[k], int(branches[k])) for k in best]
+    clearances = checker.clearances(states[best]).tolist()
+    solutions = [
+        IKSolution(states[k], clearance, distances[k], int(branches[k]))
+        for k, clearance in zip(best, clearances, strict=True)
+    ]
     if not by_distance:
         solutions.sort(key=lambda one: (-round(one.clearance, DIGITS), one.distance))
     return IKResult(tuple(solutions), "", tried, reached)
@@ -237,10 +239,7 @@ class _Part:
 
     def out_of_reach(self) -> str:
         """Return why a pose is farther away than the arm is long, or nothing where that is not shown."""
-        for pose, frame in zip(self.goal.poses, self.goal.frames, strict=True):
-            if fault := _too_far(self.robot, pose, frame, self.base, self.inverse.free):
-                return fault
-        return ""
+        return self.goal.out_of_reach(self.base)
 
     def limits_in_the_way(self, missed: Array) -> dict[str, float]:
         """Return the joints that have to leave their limits, and for which share of the descents without limits.
@@ -251,7 +250,7 @@ class _Part:
         free, missed = self.inverse.free, missed[:BLAMED]
         lower, upper = self.robot.limits.lower.copy(), self.robot.limits.upper.copy()
         lower[free], upper[free] = -2.0 * np.pi, 2.0 * np.pi
-        wide = replace(self.robot, limits=replace(self.robot.limits, lower=lower, upper=upper))
+        wide = with_range(self.robot, lower, upper)
         ends = (
             Links(wide)
             .inverse(self.goal.targets(), self.stays)
@@ -264,46 +263,6 @@ class _Part:
             for k in free[turned[free] > narrow.upper[free]]:
                 causes[f"limit of {self.robot.joint_names[k]}"] += 1
         return {cause: n / len(missed) for cause, n in causes.most_common()}
-
-
-def _too_far(robot: Robot, pose: PoseTarget, frame: Frame, base: Array, free: NDArray[np.int64]) -> str:
-    """Return why a pose is out of reach by the length of the links, or nothing.
-
-    The distance between the origins of the first and the last moved joint is at most the sum of the offsets between
-    joints in between; an orientation that is given without a free turn places the origin of the last one, and otherwise
-    the frame's own.
-    """
-    model, number = robot.model, robot.link_frame(frame.link)
-    whole = pose.orientation is not None and pose.free_turn is None and not frame.axial
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, robot.to_pinocchio(base))
-    chain, joint = list[int](), int(model.frames[number].parentJoint)
-    while joint > 0:
-        chain.insert(0, joint)
-        joint = int(model.parents[joint])
-    planned = [int(robot.state_order[model.joints[j].idx_q]) if model.joints[j].nq else -1 for j in chain]
-    moved = [k for k, one in enumerate(planned) if one in {*free.tolist()}]
-    if not moved or any("R" not in model.joints[j].shortname() for j in chain):
-        return ""
-    first, last = chain[moved[0]], chain[-1]
-    length = sum(float(np.linalg.norm(model.jointPlacements[j].translation)) for j in chain[moved[0] + 1 :])
-    local = np.array(model.frames[number].placement.homogeneous) @ frame.pose
-    wanted, slack = np.asarray(pose.position, float), pose.tolerance.position
-    at = pose_matrix(pose.position, pose.orientation or (0.0, 0.0, 0.0, 1.0))
-    if whole:
-        wanted = (at @ np.linalg.inv(local))[:3, 3]
-        slack += pose.tolerance.angle * float(np.linalg.norm(local[:3, 3]))
-    else:
-        length += float(np.linalg.norm(local[:3, 3]))
-    away = at[:3, :3].T @ (data.oMi[first].translation - wanted)
-    distance = float(np.linalg.norm(away - np.clip(away, pose.lower, pose.upper)))
-    if distance <= length + slack + ROUNDING:
-        return ""
-    what = pose.frame if last == first or not whole else f"the joint {model.names[last]}"
-    return (
-        f"{pose.frame} is out of reach: {what} has to be {distance:.3f} m from {model.names[first]}, "
-        f"and the links in between are {length:.3f} m long"
-    )
 
 
 def _combined(found: Sequence[SelfMotions], parts: Sequence[_Part], base: Array) -> tuple[Array, NDArray[np.intp]]:

@@ -40,6 +40,7 @@ from apex_ompl.ompl.validity import FullCheck, full_check, motions_until
 from apex_ompl.paths.path import Path
 from apex_ompl.planners import AnyPlanner
 from apex_ompl.planning.departure import remedy
+from apex_ompl.planning.more_goals import sampled_goal, with_more
 from apex_ompl.planning.motions import knows_obstacles, optimized_motion
 from apex_ompl.planning.query import Group, planned_joints
 from apex_ompl.planning.step_records import FoundPath, PlanQuery, ProvedPath, certificate, constraint_fields
@@ -64,6 +65,7 @@ UNNAMED = "unnamed"  # planner of a user's function before it is made
 NOT_PROVED = "a path was found but not proved in time"
 NOT_TIMED = "a path was found but not timed in time"
 CONSTRAINED_DEVIATION = 0.005  # largest deviation of a motion from a path under constraints [rad]
+GOAL_SHARE, MORE = 0.5, 2  # of the time, after which more goals are drawn, and number of their random stream
 REPAIR_SHARE = 0.5  # of the time left, for the repair of one path
 
 
@@ -170,14 +172,16 @@ def execute(query: PlanQuery, planner: ob.Planner, timeout: float) -> PlanStatus
     return status
 
 
-def solve(query: PlanQuery, *, lines: bool = True, execute: Execute = execute) -> FoundPath:
+def solve(query: PlanQuery, *, lines: bool = True, more: bool = True, execute: Execute = execute) -> FoundPath:
     """Return the straight line to a goal where it is a solution, or else the path that the planner finds.
 
-    The planner has what time is left but for the reserve; its set-up does not count.
+    The planner has what time is left but for the reserve; its set-up does not count. Where it finds no path to the
+    states of a goal in the workspace in half of that, more of them are drawn, and it searches anew for all.
 
     Args:
         query: What :func:`check` returned.
         lines: Whether straight lines are tried before the planner runs.
+        more: Whether more goals are drawn.
         execute: Runs the planner.
 
     Raises:
@@ -192,7 +196,7 @@ def solve(query: PlanQuery, *, lines: bool = True, execute: Execute = execute) -
         return _out_of_time(query)
     try:
         with quiet_ompl():
-            return _searched(query, execute)
+            return _searched(query, execute, more)
     except ApexError:
         raise
     except Exception as error:
@@ -304,14 +308,21 @@ def _holding(setup: PlanningSetup, path: Path) -> Path:
     return Path(states, path.spline, control)
 
 
-def _searched(query: PlanQuery, execute: Execute) -> FoundPath:
+def _searched(query: PlanQuery, execute: Execute, more: bool) -> FoundPath:
     """Return what the planner finds."""
-    setup, times = query.setup, query.times
-    with timed(times, "setup"), query.deadline.paused(), unforked():
-        planner = _set_up(query)
-    with motions_until(setup.motion_validator, query.ends_search):
-        status = execute(query, planner, min(query.deadline.for_search, MAX_TIME))
-    ours = reporting(planner)
+    times = query.times
+    more &= query.setup.problem.goal.joints is None and query.setup.constraints is None
+    for share in (GOAL_SHARE, 1.0) if more else (1.0,):
+        with timed(times, "setup"), query.deadline.paused(), unforked():
+            planner = _set_up(query)
+        with motions_until(query.setup.motion_validator, query.ends_search):
+            status = execute(query, planner, min(share * query.deadline.for_search, MAX_TIME))
+        goal = None if share == 1.0 or status is PlanStatus.EXACT_SOLUTION else sampled_goal(query.setup)
+        if goal is None or query.ends_search():
+            break
+        query.setup, _ = with_more(query.setup, goal, np.random.default_rng([query.setup.seed, MORE]))
+        set_goals(query.setup.simple_setup, list(query.setup.goals))
+    setup, ours = query.setup, reporting(planner)
     report = query.report = None if ours is None else ours.report
     if report is not None:
         times |= {INSIDE + stage: seconds for stage, seconds in report.times.items()}

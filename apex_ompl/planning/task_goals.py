@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from apex_ompl.collision.tables import with_range
 from apex_ompl.goals.alignment import AlignmentGoal, within
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import TOLERANCE
@@ -82,7 +83,7 @@ def task_goal(
         moving = planned_joints(robot, move.group or group or ())
     held = np.array([k for k, name in enumerate(robot.joint_names) if name not in moving], np.intp)
     lower, upper = held_range(robot.limits.lower, robot.limits.upper, start, held)
-    narrow = replace(robot, limits=replace(robot.limits, lower=lower, upper=upper)) if len(held) else robot
+    narrow = with_range(robot, lower, upper) if len(held) else robot
     states = robot.within_limits(problem.goal_states(robot.joint_names))
     states = states[[(q[held] == start[held]).all() for q in states]] if len(states) else states
     return TaskGoal(problem, narrow, start, workspace_goal(narrow, problem), states, held)

@@ -10,12 +10,13 @@ from math import isnan, nan
 import numpy as np
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.constraints.links import Links
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner, timing_in
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.result import PlanResult
-from apex_ompl.robot import Robot, load_robot
+from apex_ompl.robot import load_robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.steps import DetachStep, MotionStep, ReleaseStep, RetreatStep, Step, TakingStep, TogetherStep
 from apex_ompl.timing import Timing, Trajectory
@@ -131,7 +132,7 @@ def blend(planner: StepPlanner, first: StepPlan, second: StepPlan, timing: Timin
         if not isnan(first.left) and begin <= first.left:
             continue
         both = superposed([(first.motion, 0.0), (second.motion, begin)]).before(first.motion.duration).after(begin)
-        if _distance(robot, both, first.motion.positions[-1]) > radius:
+        if _distance(planner.checker, both, first.motion.positions[-1]) > radius:
             continue
         use = both.use(robot.limits) | ({} if more is None else more.use(both))
         kept = max(both.use(scaled).values()) <= 1.0 + ROUNDING
@@ -143,15 +144,16 @@ def blend(planner: StepPlanner, first: StepPlan, second: StepPlan, timing: Timin
     return None
 
 
-def _distance(robot: Robot, motion: Trajectory, corner: Array) -> float:
+def _distance(checker: CollisionChecker, motion: Trajectory, corner: Array) -> float:
     """Return the largest distance of the origins of hands from where they are at a state, shape (dof,) [m]."""
-    worst, states = 0.0, motion(np.linspace(0.0, motion.duration, SAMPLES))
+    robot, worst = checker.robot, 0.0
+    states = np.concatenate([corner[None], motion(np.linspace(0.0, motion.duration, SAMPLES))])
+    turns, origins = checker.kernel.joint_frames(states)
     for hand in robot.hands.values():
-        point = np.append(hand.point, 1.0)
-        at = (robot.link_pose(corner, hand.palm) @ point)[:3]
-        places = np.array([(robot.link_pose(q, hand.palm) @ point)[:3] for q in states])
-        between = np.linalg.norm(np.diff(places, axis=0), axis=1).max() / 2.0
-        worst = max(worst, float(np.linalg.norm(places - at, axis=1).max() + between))
+        joint, point = Links.of(robot).point(hand.palm, hand.point)
+        places = origins[:, joint] + (turns[:, joint] * np.asarray(point, float)).sum(axis=2)
+        between = np.linalg.norm(np.diff(places[1:], axis=0), axis=1).max() / 2.0
+        worst = max(worst, float(np.linalg.norm(places[1:] - places[0], axis=1).max() + between))
     return worst
 
 

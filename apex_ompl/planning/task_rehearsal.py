@@ -69,7 +69,7 @@ class Rehearsal:
         """
         self.planner, self.stages, self.seed, self.stop = planner, stages(planner.problem), seed, stop
         self._group = group
-        self._visits, self._thorough = 0, False
+        self._visits, self._thorough, self._explains = 0, False, True
 
     def later_goals(self, k: int, world: TaskWorld, q: Array, thorough: bool = False) -> list[Array]:
         """Return goals of the stages after one, all of which can be reached and left by their steps.
@@ -83,7 +83,7 @@ class Rehearsal:
         Raises:
             StepFailed: There are none, as far as was tried.
         """
-        self._visits, self._thorough = 0, thorough
+        self._visits, self._thorough, self._explains = 0, thorough, True
         return self._from(k, world, q)
 
     def _from(self, k: int, world: TaskWorld, q: Array) -> list[Array]:
@@ -99,6 +99,7 @@ class Rehearsal:
                 return [goal, *self._from(k + 1, world, goal)]
             except StepFailed as failure:
                 failures.append(failure)
+                self._explains = False  # the first failure is the one that is told
         if not failures:
             raise StepFailed(f"{move.title}: no free state was found that reaches it")
         raise failures[0]
@@ -151,6 +152,8 @@ class Rehearsal:
         if len(track.u) < len(tracker.grid) and self._thorough:
             track = tracker.follow(q)
         if len(track.u) < len(tracker.grid):
+            if not self._explains:
+                raise StepFailed("not tracked")
             end = dead_end(tracker, track)
             raise StepFailed(end.reason, " ".join((f"{end.end}", *end.names)))
         last: Array = track.states[-1]

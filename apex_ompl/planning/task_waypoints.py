@@ -110,7 +110,7 @@ def _share(world: TaskWorld, moves: Mapping[str, Array], gap: float, q: Array) -
     Raises:
         StepFailed: It is nearer than that at the start.
     """
-    others = [world_geometry(body) for body in (*world.robot.fixtures, *world.scene.values())]
+    others = [world_geometry(body) for body in (*world.fixtures, *world.scene.values())]
     along = {world.held[name].link for name in moves}  # what these links hold moves along
     others += [(coal_geometry(o), held_pose(world, n, q)) for n, o in world.held.items() if o.link not in along]
     least, request = 1.0, coal.DistanceRequest()

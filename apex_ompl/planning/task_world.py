@@ -19,9 +19,10 @@ from apex_ompl.planning.line_query import tools_of
 from apex_ompl.planning.query import planned_joints
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
-from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
+from apex_ompl.scene.bodies import MOTION, AttachedObject, Body, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import (
+    AddStep,
     AllowStep,
     AttachStep,
     BodiesStep,
@@ -31,6 +32,7 @@ from apex_ompl.scene.steps import (
     HandStep,
     LineStep,
     ReleaseStep,
+    RemoveStep,
     RetreatStep,
     TakingStep,
     TogetherStep,
@@ -53,6 +55,7 @@ class TaskWorld:
         held: Held objects by name.
         allowed: Pairs of bodies that may touch.
         leaving: Hand -> objects that it released and may still touch.
+        away: Obstacles and fixtures that a step removed, by name.
     """
 
     robot: Robot
@@ -60,6 +63,7 @@ class TaskWorld:
     held: Mapping[str, AttachedObject]
     allowed: frozenset[Pair]
     leaving: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    away: Mapping[str, Body] = field(default_factory=dict)
 
     @classmethod
     def of(cls, robot: Robot, problem: Problem) -> TaskWorld:
@@ -69,12 +73,25 @@ class TaskWorld:
 
     @property
     def pairs(self) -> frozenset[Pair]:
-        """Pairs that may touch, with those of hands and what they are leaving."""
-        return self.allowed | {pair for hand in self.leaving for pair in self.leaving_pairs(hand)}
+        """Pairs that may touch, with those of hands and what they are leaving, and of fixtures that are away."""
+        leaving = {pair for hand in self.leaving for pair in self.leaving_pairs(hand)}
+        fixtures = [body.name for body in self.robot.fixtures if body.name in self.away]
+        others = (*self.solid_links, *self.held) if fixtures else ()
+        return self.allowed | leaving | {(other, name) for name in fixtures for other in others}
+
+    @property
+    def fixtures(self) -> tuple[Body, ...]:
+        """Fixtures of the robot that no step removed."""
+        return tuple(body for body in self.robot.fixtures if body.name not in self.away)
+
+    @property
+    def solid_links(self) -> frozenset[str]:
+        """Names of the links that have a shape."""
+        return frozenset(link_of(self.robot.model, item) for item in self.robot.geometry.geometryObjects)
 
     def leaving_pairs(self, hand: str) -> frozenset[Pair]:
         """Return the pairs of the links of a hand and the objects that it is leaving."""
-        solid = {link_of(self.robot.model, item) for item in self.robot.geometry.geometryObjects}
+        solid = self.solid_links
         links = [link for link in hand_links(self.robot, hand) if link in solid]
         return frozenset((link, name) for name in self.leaving.get(hand, ()) for link in links)
 
@@ -137,6 +154,12 @@ class TaskWorld:
             pairs = {_pair(*pair) for pair in step.pairs}
             rest = {pair for pair in self.allowed if _pair(*pair) not in pairs}
             return replace(self, allowed=frozenset(rest | pairs if step.contact else rest))
+        if isinstance(step, RemoveStep):
+            return self._without(step.objects)
+        if isinstance(step, AddStep):
+            back = {name: body for name in step.objects if isinstance(body := self.away[name], Obstacle)}
+            away = {name: body for name, body in self.away.items() if name not in step.objects}
+            return replace(self, scene={**self.scene, **back}, away=away)
         if isinstance(step, TogetherStep):
             world = self
             for one in step.steps:
@@ -147,6 +170,17 @@ class TaskWorld:
         if isinstance(step, RetreatStep):
             return replace(self, leaving={hand: names for hand, names in self.leaving.items() if hand != step.hand})
         return self
+
+    def _without(self, names: Sequence[str]) -> TaskWorld:
+        """Return the world without obstacles and fixtures; pairs of obstacles that may touch are forgotten."""
+        known = {**{body.name: body for body in self.robot.fixtures}, **self.scene}
+        scene = {name: one for name, one in self.scene.items() if name not in names}
+        allowed = frozenset(pair for pair in self.allowed if not {*names} & self.scene.keys() & {*pair})
+        leaving = {hand: tuple(n for n in left if n not in names) for hand, left in self.leaving.items()}
+        return replace(
+            self, scene=scene, allowed=allowed, leaving={h: left for h, left in leaving.items() if left},
+            away={**self.away, **{name: known[name] for name in names}},
+        )  # fmt: skip
 
     def _released(self, step: ReleaseStep, q: Array) -> TaskWorld:
         names = self.held_by(step.hand) if step.objects is None else step.objects
@@ -275,6 +309,13 @@ def _body_faults(world: TaskWorld, step: BodiesStep) -> Iterable[tuple[str, obje
     elif isinstance(step, DetachStep):
         if step.object not in world.held:
             yield "object", step.object, f"expected a held object: {', '.join(world.held) or 'there is none'}"
+    elif isinstance(step, RemoveStep):
+        there = (*world.scene, *(body.name for body in world.fixtures))
+        expected = f"expected obstacles or fixtures: {', '.join(there) or 'there is none'}"
+        yield from (("objects", name, expected) for name in step.objects if name not in there)
+    elif isinstance(step, AddStep):
+        expected = f"expected what a step removed: {', '.join(world.away) or 'nothing'}"
+        yield from (("objects", name, expected) for name in step.objects if name not in world.away)
     elif isinstance(step, AllowStep):
         fixtures = [body.name for body in world.robot.fixtures]
         known = (*world.robot.link_names, *world.held, *world.scene, *fixtures)

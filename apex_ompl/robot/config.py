@@ -118,6 +118,9 @@ class Hand(StrictModel):
         point: Grasp point in the palm's frame [m].
         axis: Outward unit normal of the palm on its closing side, in the palm's frame.
         fingers: Unit direction of the open fingers, in the palm's frame.
+        jaws: Links of a parallel gripper -> their displacement from open, as they are locked, to closed, in their own
+            frames [m]. Plans keep them open; in physics they close on what a step grasps.
+        force: Force of each jaw [N].
     """
 
     synergy: str | None = None
@@ -125,6 +128,17 @@ class Hand(StrictModel):
     point: Vector
     axis: Vector
     fingers: Vector
+    jaws: dict[Name, Vector] = {}
+    force: PositiveFloat = 30.0
+
+    @model_validator(mode="after")
+    def _jaws_move(self) -> Self:
+        if self.jaws and self.synergy is not None:
+            raise ValueError("expected either a synergy or jaws, not both")
+        for link, way in self.jaws.items():
+            if not any(way):
+                raise ValueError(f"expected a displacement of the jaw {link!r} that is not zero")
+        return self
 
 
 class RobotConfig(StrictModel):

@@ -413,6 +413,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     for hand in config.hands.values():
         if not model.existBodyName(hand.palm):
             raise FileFormatError(str(path), "hands", hand.palm, "expected a link of the robot as palm")
+        for link in hand.jaws:
+            if not model.existBodyName(link):
+                raise FileFormatError(str(path), "hands", link, "expected links of the robot as jaws")
     groups = {g: np.array([names.index(n) for n in members]) for g, members in config.groups.items()}
     limits = _limits(config, model, path)
     effort = np.array([joint.effort for joint in config.joints.values()])

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from apex_ompl.scene.problem import PoseTarget as PoseTarget
     from apex_ompl.scene.problem import Problem as Problem
     from apex_ompl.scene.problem import Tolerance as Tolerance
+    from apex_ompl.scene.steps import AddStep as AddStep
     from apex_ompl.scene.steps import AllowStep as AllowStep
     from apex_ompl.scene.steps import AttachStep as AttachStep
     from apex_ompl.scene.steps import DetachStep as DetachStep
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from apex_ompl.scene.steps import HandStep as HandStep
     from apex_ompl.scene.steps import LineStep as LineStep
     from apex_ompl.scene.steps import ReleaseStep as ReleaseStep
+    from apex_ompl.scene.steps import RemoveStep as RemoveStep
     from apex_ompl.scene.steps import RetreatStep as RetreatStep
     from apex_ompl.scene.steps import TogetherStep as TogetherStep
     from apex_ompl.scene.steps import TurnStep as TurnStep
@@ -46,7 +48,7 @@ __all__, __getattr__, __dir__ = lazy_names(
         "constraints": "FixedOrientation OnLine OnPlane Pose PoseTolerance RelativePose ToolRegion Upright",
         "points": "points_from_depth",
         "problem": "Alignment Goal GraspGoal MoveStep PoseTarget Problem Tolerance",
-        "steps": "AllowStep AttachStep DetachStep GraspStep HandStep LineStep ReleaseStep RetreatStep TogetherStep "
-        "TurnStep WaitStep",
+        "steps": "AddStep AllowStep AttachStep DetachStep GraspStep HandStep LineStep ReleaseStep RemoveStep "
+        "RetreatStep TogetherStep TurnStep WaitStep",
     },
 )

@@ -38,7 +38,7 @@ from apex_ompl.scene.bodies import (
     pose_matrix,
 )
 from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
-from apex_ompl.scene.steps import AllowStep, MotionStep, Names, SimultaneousStep, TogetherStep
+from apex_ompl.scene.steps import MotionStep, Names, SceneStep, SimultaneousStep, TogetherStep
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
@@ -323,7 +323,7 @@ class MoveStep(MotionStep):
         return " and ".join(one.link if isinstance(one, WorldVector) else one for one in sides)
 
 
-AnyStep = Annotated[MoveStep | SimultaneousStep | AllowStep | TogetherStep, Field(discriminator="kind")]
+AnyStep = Annotated[MoveStep | SimultaneousStep | SceneStep | TogetherStep, Field(discriminator="kind")]
 """A step after the goal in a problem file."""
 
 

@@ -311,13 +311,47 @@ class AllowStep(Step):
         return pairs if self.contact else f"{pairs} no longer"
 
 
+class RemoveStep(Step):
+    """Obstacles or fixtures of the robot are gone from now on.
+
+    Attributes:
+        objects: Their names.
+    """
+
+    kind: Literal["remove"] = "remove"
+    objects: Names
+
+    @property
+    def subject(self) -> str:
+        """The objects."""
+        return " and ".join(self.objects)
+
+
+class AddStep(Step):
+    """Obstacles or fixtures that a step removed are back where they were, from now on.
+
+    Attributes:
+        objects: Their names.
+    """
+
+    kind: Literal["add"] = "add"
+    objects: Names
+
+    @property
+    def subject(self) -> str:
+        """The objects."""
+        return " and ".join(self.objects)
+
+
+SceneStep = AllowStep | RemoveStep | AddStep
+"""A step that changes what the robot may touch; nothing moves."""
 StraightStep = LineStep | TurnStep | RetreatStep
 """A step along which frames go straight, or turn."""
 HandedStep = HandStep | ReleaseStep | GraspStep
 """A step in which a hand opens or closes."""
 TakingStep = GraspStep | AttachStep
 """A step after which an object is held."""
-BodiesStep = AttachStep | DetachStep | AllowStep
+BodiesStep = AttachStep | DetachStep | SceneStep
 """A step in which bodies change and nothing moves."""
 SimultaneousStep = (
     LineStep | TurnStep | HandStep | ReleaseStep | GraspStep | RetreatStep | WaitStep | AttachStep | DetachStep

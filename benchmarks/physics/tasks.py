@@ -18,7 +18,7 @@ import json
 import textwrap
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,12 +75,19 @@ def causes(run: TaskRun) -> list[str]:
 
 def stored(name: str, seeds: Sequence[int], folder: Path, pictures: Path | None = None) -> list[dict[str, Any]]:
     """Make the runs of a problem that are missing, draw those that fail into a folder, and return all."""
-    files = [folder / f"{name}.{seed}.json" for seed in seeds]
     runner = TaskRunner(problems.load(name), Spread(), timeout=TIMEOUT)
+    return made(name, seeds, folder, lambda _: runner, pictures)
+
+
+def made(
+    name: str, seeds: Sequence[int], folder: Path, runner_of: Callable[[int], TaskRunner], pictures: Path | None = None
+) -> list[dict[str, Any]]:
+    """Make the runs of seeds that are missing in a folder, each by the runner of its seed, and return all."""
+    files = [folder / f"{name}.{seed}.json" for seed in seeds]
     for seed, file in zip(seeds, tqdm(files, desc=name, mininterval=10.0), strict=True):
         if file.exists():
             continue
-        started = time.process_time()
+        started, runner = time.process_time(), runner_of(seed)
         run, _ = runner.run(seed)
         data = row_of(run, time.process_time() - started)
         if pictures is not None and not run and runner.executor is not None:

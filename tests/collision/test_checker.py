@@ -153,6 +153,26 @@ def test_distance_is_positive_where_free_and_not_where_colliding(robot: Robot) -
             assert clearance <= 1e-4
 
 
+def test_clearances_of_many_states_are_those_of_coal(robot: Robot) -> None:
+    rng = np.random.default_rng(9)
+    checker = CollisionChecker(robot, clutter(rng, 6))
+    states = states_around_home(robot, rng, 24, 0.6)
+    free, found = checker.are_free(states), checker.clearances(states)
+    assert 3 < free.sum() < len(states)
+    naive, request = Naive(checker), coal.DistanceRequest()
+    for q, clearance in zip(states[free][:6], found[free][:6], strict=True):  # a distance of all pairs takes long
+        pin.forwardKinematics(robot.model, naive.data, robot.to_pinocchio(q))
+        poses = {k: naive.data.oMi[solid.joint] * solid.placement for k, solid in naive.solids.items()}
+        placed = {k: (naive.solids[k].shape, coal.Transform3s(p.rotation, p.translation)) for k, p in poses.items()}
+        pairs = ((*placed[a], *placed[b]) for a, b in naive.pairs)
+        least = min(coal.distance(*pair, request, coal.DistanceResult()) for pair in pairs)
+        assert clearance == pytest.approx(least, abs=2e-5)
+    np.testing.assert_allclose(found[~free], [checker.clearance(q) for q in states[~free]])
+    assert (found[~free] <= 0.0).all() and checker.clearances(states[:0]).shape == (0,)
+    with pytest.raises(ParameterError, match="states"):
+        checker.clearances(states[:, :3])
+
+
 def test_scene_changes_equal_a_scene_built_anew(robot: Robot) -> None:
     rng = np.random.default_rng(4)
     scene = clutter(rng, 5)

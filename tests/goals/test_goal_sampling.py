@@ -126,7 +126,16 @@ def test_a_pose_out_of_reach_keeps_its_reason(robot: Robot) -> None:
     goal = Goal(poses=(PoseTarget(frame="left_hand", position=(3.0, 0.0, 0.5)),))
     result = plan(problem.model_copy(update={"goal": goal}))
     assert result.status is PlanStatus.INVALID_GOAL
-    assert result.reason.startswith("not reached in 200 attempts; the best has position of left_hand ")
+    assert result.reason.startswith("left_hand is out of reach: left_hand has to be ")
+
+
+def test_what_is_not_shown_to_be_out_of_reach_is_not_said_to_be(robot: Robot) -> None:
+    pose = pose_target(robot, robot.home, "left_hand")
+    near = (robot.link_pose(robot.home, "left_link1")[:3, 3] + [0.02, 0.0, 0.0]).tolist()  # inside of the arm
+    goal = PoseGoal(robot, [pose.model_copy(update={"position": tuple(near)})], (), robot.home)
+    found = sample(goal, CollisionChecker(robot), np.random.default_rng(0))
+    assert not len(found.states) and found.fault.startswith("none found in 200 descents")
+    assert "out of reach" not in found.fault and not goal.out_of_reach()
 
 
 def test_held_joints_stay(robot: Robot) -> None:

@@ -132,13 +132,13 @@ def test_unreachable_says_so_with_the_best_error(robot: Robot) -> None:
     far = goal_of(robot, "horizontal", distance=5.0)
     found = sample(far, CollisionChecker(robot), np.random.default_rng(0), count=3, max_attempts=6)
     assert len(found.states) == 0 and found.attempts == 6 and found.converged == 0
-    assert found.fault.startswith("not reached in 6 attempts; the best has lateral ") and " m off" in found.fault
+    assert found.fault.startswith("none found in 6 descents; the best has lateral ") and " m off" in found.fault
     problem = load_problem("ball_in_cup")
     far_problem = problem.model_copy(
         update={"goal": Goal(alignment=problem.goal.alignment.model_copy(update={"distance": 5.0}))}
     )
     result = plan(far_problem)
-    assert result.status is PlanStatus.INVALID_GOAL and "not reached" in result.reason
+    assert result.status is PlanStatus.INVALID_GOAL and "none found in 200 descents" in result.reason
 
 
 def test_aligned_states_that_all_collide_say_with_what(robot: Robot) -> None:

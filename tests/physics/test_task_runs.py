@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,17 @@ import pytest
 from physics import library
 from planning import cached_problem
 
-from apex_ompl import plan_task
+from apex_ompl import MotionPlanner, plan_task
 from apex_ompl.cli import main
 from apex_ompl.drivers import TwinSettings
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
-from apex_ompl.physics import Spread, TaskRun, TaskRunner, execution
+from apex_ompl.physics import Spread, TaskRun, TaskRunner, execute, execution
 from apex_ompl.physics.execution import GRAVITY, STEEPEST, intended, motion_of
+from apex_ompl.problems import cells
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
+from apex_ompl.scene.steps import WaitStep
 
 library()
 SECONDS = 120.0
@@ -188,3 +191,38 @@ def test_the_command_refuses_bad_input(arguments: list[str], message: str, capsy
     assert main(["run", *arguments]) == 2
     err = capsys.readouterr().err
     assert message in err and "Traceback" not in err and err.count("\n") == 1
+
+
+def test_a_gripper_takes_a_box_out_of_a_bin() -> None:
+    run, _ = TaskRunner(cells.draw("pick_and_place", 3), Spread(place=0.0), timeout=SECONDS).run(4)
+    assert run, run.reason
+    assert [(one.object, one.hand, one.kind) for one in run.grasps] == [("box", "hand", "friction")]
+    assert run.grasps[0].links == ("panda_leftfinger", "panda_rightfinger")
+    heights = run.poses["box"][:, 2]
+    assert heights.max() > heights[0] + 0.1 and np.linalg.norm(run.poses["box"][-1, :2] - run.poses["box"][0, :2]) > 0.2
+
+
+def test_what_a_step_removes_is_gone_in_physics_until_it_is_added() -> None:
+    with MotionPlanner("panda") as planner:
+        at = planner.fk("home", "hand")[:3, 3]
+        planner.world.add(name="door", box=(0.3, 0.3, 0.02), position=tuple(at - [0.0, 0.0, 0.1]))
+        steps: list[Any] = [
+            {"kind": "remove", "objects": "door"}, {"kind": "line", "frame": "hand", "by": (0, 0, -0.15)},
+            {"kind": "line", "frame": "hand", "by": (0, 0, 0.15)}, {"kind": "add", "objects": "door"},
+        ]  # fmt: skip
+        plan = planner.sequence("home", steps, timeout=SECONDS)
+    run = execute(plan)
+    assert run and not run.contacts, run.reason
+    blind = replace(plan, problem=plan.problem.model_copy(update={"after": (WaitStep(seconds=1.0),) * 4}))
+    hit = execute(blind)
+    assert {"door"} <= {name for pair in hit.contacts for name in pair}
+
+
+def test_a_plan_is_executed_as_it_is() -> None:
+    plan = plan_task(cells.draw("pick_and_place", 5), timeout=SECONDS)
+    run = execute(plan)
+    assert run, run.reason
+    body = next(one for one in plan.steps[-1].scene if one.name == "box")
+    assert np.linalg.norm(run.poses["box"][-1, :3] - np.asarray(body.position)) < 0.01
+    with pytest.raises(ParameterError, match="planned and timed"):
+        execute(replace(plan, trajectory=None))

@@ -210,6 +210,41 @@ def test_a_link_takes_an_object_and_leaves_it_and_contacts_are_allowed_for_a_tim
         np.testing.assert_allclose(left.position, at + [0.0, 0.0, 0.02], atol=1e-3)
 
 
+def test_obstacles_and_fixtures_are_gone_until_they_are_added() -> None:
+    with MotionPlanner() as planner:  # whose table is a fixture
+        down = planner.fk("home", "left_hand")[2, 3] - 0.02  # from the tips to the table, and on
+        line = entry("line", frame="left_hand", by=(0.0, 0.0, -down))
+        up = entry("line", frame="left_hand", by=(0.0, 0.0, down))
+        stopped = planner.sequence("home", [line], timeout=SECONDS).reason
+        assert "table_left" in stopped
+        removed, added = entry("remove", objects="table_left"), entry("add", objects=["table_left"])
+        result = planner.sequence("home", [removed, line, up, added], timeout=SECONDS)
+        assert result.trajectory is not None, result.reason
+        deep = planner.robot.link_pose(result.steps[2].path.states[-1], "left_hand_palm")[2, 3]
+        free = [planner.is_free(step.path.states[-1]) for step in result.steps]
+        assert deep < 0.1 and free == [True, True, False, True, True]
+        below = planner.sequence("home", [removed, line, added], timeout=SECONDS)
+        assert not below and "add table_left" in below.reason
+        assert planner.robot.fixtures[0].name == "table_left" and not planner.is_free(result.steps[2].path.states[-1])
+
+
+def test_obstacles_are_gone_with_what_was_allowed() -> None:
+    with MotionPlanner("panda") as planner:
+        at = planner.fk("home", "hand")[:3, 3]
+        planner.world.add(name="door", box=(0.3, 0.3, 0.02), position=tuple(at - [0.0, 0.0, 0.1]))
+        planner.world.add(name="wall", box=(0.1, 0.1, 0.1), position=(-0.6, 0.0, 0.3))
+        down, up = (entry("line", frame="hand", by=(0, 0, by)) for by in (-0.15, 0.15))
+        allow = entry("allow", pairs=[("door", "panda_hand"), ("wall", "panda_hand")])
+        steps = [allow, entry("remove", objects="door"), down, up, entry("add", objects="door")]
+        result = planner.sequence("home", steps, timeout=SECONDS)
+        assert result, result.reason
+        assert [["door" in {one.name for one in step.scene}] for step in result.steps] == [
+            [True], [True], [False], [False], [False], [True],
+        ]  # fmt: skip
+        assert [pair for pair in result.steps[-1].allowed if "panda_hand" in pair] == [("panda_hand", "wall")]
+        assert {"door", "wall"} == planner.world.obstacles.keys()
+
+
 def test_both_arms_go_at_once_each_along_its_own_line() -> None:
     with MotionPlanner() as planner:
         robot = planner.robot
@@ -278,6 +313,8 @@ def test_grasps_are_poses_of_the_hand_where_the_object_is() -> None:
         ({"kind": "allow", "pairs": "box"}, "after.0.pairs: expected a list, got 'box'"),
         ({"kind": "together", "steps": [{"kind": "wait", "seconds": 1.0}]}, "after.0.steps: expected 2 items or more"),
         ({"kind": "line", "frame": ["hand", "hand", 3], "by": (0, 0, 1)}, "after.0.frame.2: "),
+        ({"kind": "remove", "objects": ["boxx"]}, "after.0.objects: expected obstacles or fixtures: box"),
+        ({"kind": "add", "objects": "box"}, "after.0.objects: expected what a step removed: nothing"),
         ({"kind": "move", "goal": "hme"}, "did you mean 'home'"),
         (
             {"kind": "move", "goal": {"joints": {"joint1": 0.0}}, "blend": 0.1},

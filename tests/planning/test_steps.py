@@ -6,15 +6,19 @@ import traceback
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
+from ompl import base as ob
 from ompl import geometric as og
 from planning import HARD, cached_problem
 
-from apex_ompl import MotionPlanner, PlanStatus, plan, planners
+from apex_ompl import MotionPlanner, PlanStatus, PoseTarget, plan, planners
 from apex_ompl.apex import ApexParameters
 from apex_ompl.errors import ParameterError, UnknownNameError
 from apex_ompl.planners import APEX
 from apex_ompl.planning import assemble, check, prove, solve, time
+from apex_ompl.planning.step_records import PlanQuery
+from apex_ompl.planning.steps import execute
 
 pytestmark = pytest.mark.usefixtures("quiet")
 
@@ -58,6 +62,44 @@ def test_failures_are_handed_on() -> None:
         check(assemble(problem), "rrtconect")
     with pytest.raises(ParameterError, match="timeout"):
         check(assemble(problem), timeout=0.0)
+
+
+def test_more_goals_are_drawn_where_the_first_ones_are_not_reached() -> None:
+    with MotionPlanner("panda") as planner:
+        planner.world.add(name="post", box=(0.05, 0.05, 0.6), position=(0.5, 0.0, 0.3))
+        pose = PoseTarget(frame="hand", position=(0.5, 0.3, 0.4), orientation=(1.0, 0.0, 0.0, 0.0))
+        problem = planner.problem("home", pose)
+    times, goals = list[float](), list[int]()
+
+    def fails_first(query: PlanQuery, ompl: ob.Planner, timeout: float) -> PlanStatus:
+        times.append(timeout)
+        goals.append(len(query.setup.valid_goals))
+        return PlanStatus.TIMEOUT if len(times) == 1 else execute(query, ompl, timeout)
+
+    setup = assemble(problem, seed=2)
+    found = solve(check(setup, timeout=20.0), lines=False, execute=fails_first)
+    assert found and found.path is not None
+    assert times[0] == pytest.approx(0.5 * 19.5, abs=0.1) and times[1] > 19.0  # all that is left
+    assert 0 < goals[0] == len(setup.valid_goals) < goals[1] == len(found.query.setup.valid_goals)
+    goal, data = pin.SE3(pin.Quaternion(0.0, 1.0, 0.0, 0.0), np.array(pose.position)), setup.robot.model.createData()
+    for q in found.query.setup.valid_goals:  # by Pinocchio, all of them reach the pose
+        pin.framesForwardKinematics(setup.robot.model, data, setup.robot.to_pinocchio(q))
+        hand = data.oMf[setup.robot.link_frame("panda_hand")] * pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.1034]))
+        assert np.abs(pin.log6(goal.actInv(hand)).vector).max() < 2e-3 and setup.checker.is_free(q)
+    assert (np.abs(found.query.setup.valid_goals - found.path.states[-1]).max(axis=1) == 0.0).any()
+
+
+@pytest.mark.parametrize("more", [True, False])
+def test_goals_that_are_states_are_searched_for_once(more: bool) -> None:
+    calls = list[float]()
+
+    def fails(query: PlanQuery, ompl: ob.Planner, timeout: float) -> PlanStatus:
+        calls.append(timeout)
+        return PlanStatus.TIMEOUT
+
+    problem = cached_problem(PROBLEM if more else "handover")
+    assert (problem.goal.joints is None) != more
+    assert not solve(check(assemble(problem), timeout=5.0), lines=False, more=more, execute=fails) and len(calls) == 1
 
 
 def test_planners_are_given_by_name_parameters_or_function() -> None:
