@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import io
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from apex_ompl.evaluation import Results
 from apex_ompl.evaluation.metrics import failure_ratio
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Notes = list[tuple[str, Any]]
+ASKED = "asked"  # entry of the provenance of results: how many runs of each row a figure asks for
 DPI = 120
 
 
@@ -90,14 +94,29 @@ def of_runs(results: Results, *, planned: bool = True) -> tuple[Notes, str]:
         planned: Whether the runs were planned by OMPL's Benchmark, so that its notes and warnings are of interest.
     """
     commits = record.made_with(results)["run_commits"]
-    sessions = results.sessions()
+    sessions, cost = results.sessions(), cost_of(results)
     wanted = {"Hardware", "Versions", "Split and first seed", *(("Spacing of states",) if planned else ())}
     short = [pair for pair in about(results) if pair[0] in wanted]
     commands = dict.fromkeys(f"{one['command']} ({one['jobs']} at a time)" for one in sessions)
     dates = sorted(one["date"][:10] for one in sessions)
     made = [("Commands", "; ".join(commands)), ("Dates", f"{dates[0]} to {dates[-1]}")]
+    made += [("Runs", f"{cost['runs']} of {cost['of']}; CPU time of all {cost['core_hours']:.1f} core-hours, by "
+                      f"{cost['timed']} runs that stored theirs")] if cost["timed"] else []  # fmt: skip
     notes = [("Note", warning) for warning in warnings(results)] if planned else []
     return [*made, *short, ("Commits of the runs", commits), *notes], commits
+
+
+def cost_of(results: Results) -> dict[str, Any]:
+    """Return what a figure takes: runs that are there, and that it asks for, and the CPU time of all [core-hours].
+
+    That time is each row's mean CPU time, by the runs that stored theirs (``timed``), times the runs asked for.
+    """
+    asked = Counter(results.about.get(ASKED, {}))
+    seconds = {label: [run["cpu"] for run in results.runs if run["label"] == label and run.get("cpu") is not None]
+               for label in asked}  # fmt: skip
+    total = sum(float(np.mean(some)) * asked[label] for label, some in seconds.items() if some)
+    return {"runs": len(results.runs), "of": asked.total(), "timed": sum(map(len, seconds.values())),
+            "core_hours": total / 3600.0}  # fmt: skip
 
 
 def number(value: float | None, digits: int = 2) -> str:
