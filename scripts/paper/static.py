@@ -50,13 +50,13 @@ def runs_of(
 ) -> Results:
     """Return the runs of some rows on the first problems of some levels, one part after the other.
 
-    Missing ones are made, unless the arguments ask for a ``report`` of those that are stored.
+    Missing ones are made, with the argument ``central`` those of the first part alone, with ``report`` none.
     """
     out, wanted = args.keep / folder, dict[str, str]()
-    for levels, rows in parts:
+    for number, (levels, rows) in enumerate(parts):
         there = jobs_of(levels, rows, runs=args.n, timeout=timeout, seed=0, split=split, simplify=True)
         wanted |= {job.key: job.label for job in there}
-        if not args.report:
+        if not args.report and (number == 0 or not args.central):
             bench(levels, rows, out, runs=args.n, timeout=timeout, workers=Workers(jobs), split=split,
                   provenance=record.session())  # fmt: skip
     found = Results.load(out)
