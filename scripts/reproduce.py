@@ -16,9 +16,10 @@ cubes, guided and not, standing, passing and brought in), 200 of apex on a size,
 of the other planners on each task and size; ``-n`` is the largest number on a level (:mod:`paper.rows`).
 
 Every run is stored in benchmarks/runs when it ends: stop the command at any moment and give it again. ``failure`` and
-``size`` have the same runs; ``strips`` and ``failures`` pick theirs from those of ``dynamic``. ``--central``
-makes the runs of the central claim alone, ``--report`` none; both write what the stored runs tell. ``python -m benchmarks.lib.pack pack paper_static`` packs those of the
-folder into benchmarks/packed at any moment, and ``unpack`` brings them to another machine, where the command resumes.
+``size`` have the same runs; ``strips`` and ``failures`` pick theirs from those of ``dynamic``. ``--central`` makes the
+runs of the central claim alone, ``--report`` none; both write what the stored runs tell. ``python -m
+benchmarks.lib.pack pack paper_static`` packs those of a folder into benchmarks/packed at any moment, and ``unpack``
+brings them to another machine, where the command resumes.
 
 Usage: python scripts/reproduce.py all|FIGURE|page [-n N] [--jobs 2] [--central] [--report] [--keep FOLDER]
     [-o FOLDER] [--page FILE]

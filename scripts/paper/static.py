@@ -53,10 +53,10 @@ def runs_of(
     Missing ones are made, with the argument ``central`` those of the first part alone, with ``report`` none.
     """
     out, wanted = args.keep / folder, dict[str, str]()
-    for number, (levels, rows) in enumerate(parts):
+    for k, (levels, rows) in enumerate(parts):
         there = jobs_of(levels, rows, runs=args.n, timeout=timeout, seed=0, split=split, simplify=True)
         wanted |= {job.key: job.label for job in there}
-        if not args.report and (number == 0 or not args.central):
+        if not args.report and (k == 0 or not args.central):
             bench(levels, rows, out, runs=args.n, timeout=timeout, workers=Workers(jobs), split=split,
                   provenance=record.session())  # fmt: skip
     found = Results.load(out)
