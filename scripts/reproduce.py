@@ -16,12 +16,12 @@ cubes, guided and not, standing, passing and brought in), 200 of apex on a size,
 of the other planners on each task and size; ``-n`` is the largest number on a level (:mod:`paper.rows`).
 
 Every run is stored in benchmarks/runs when it ends: stop the command at any moment and give it again. ``failure`` and
-``size`` have the same runs; ``strips`` and ``failures`` pick theirs from those of ``dynamic``. ``--central`` makes the
+``size`` have the same runs; ``strips`` and ``failures`` pick theirs from those of ``dynamic``. ``--parts 1`` makes the
 runs of the central claim alone, ``--report`` none; both write what the stored runs tell. ``python -m
 benchmarks.lib.pack pack paper_static`` packs those of a folder into benchmarks/packed at any moment, and ``unpack``
 brings them to another machine, where the command resumes.
 
-Usage: python scripts/reproduce.py all|FIGURE|page [-n N] [--jobs 2] [--central] [--report] [--keep FOLDER]
+Usage: python scripts/reproduce.py all|FIGURE|page [-n N] [--jobs 2] [--parts M] [--report] [--keep FOLDER]
     [-o FOLDER] [--page FILE]
 """
 
@@ -61,8 +61,7 @@ FIGURES = {
 }
 """Module of each figure, in the order of ``all``, with the default number of problems or runs and its unit."""
 ALL, PAGE = "all", "page"
-CLAIMED = ("failure", "size", "imposed", "dynamic")
-STORED = ("time", *CLAIMED)
+STORED = ("time", "failure", "size", "imposed", "dynamic")
 
 
 def parsed() -> argparse.Namespace:
@@ -73,7 +72,7 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("-n", type=one_or_more, help=f"number of problems or runs of a figure (defaults: {usual})")
     parser.add_argument("--jobs", type=one_or_more, default=2, help="runs at a time, except for time (default: 2)")
     parser.add_argument("--report", action="store_true", help="run nothing; write the results of the stored runs")
-    parser.add_argument("--central", action="store_true", help="make the runs of the central claim alone")
+    parser.add_argument("--parts", type=one_or_more, metavar="M", help="make the first M parts of the runs alone")
     parser.add_argument("--keep", type=Path, default=ROOT / "benchmarks" / "runs", metavar="FOLDER", help="for runs")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "benchmarks" / "results", metavar="FOLDER")
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "paper.md", metavar="FILE")
@@ -82,8 +81,8 @@ def parsed() -> argparse.Namespace:
         parser.error("-n is for one figure")
     if args.report and args.figure not in STORED:
         parser.error(f"--report is for {', '.join(STORED)}")
-    if args.central and args.figure not in CLAIMED:
-        parser.error(f"--central is for {', '.join(CLAIMED)}")
+    if args.parts is not None and args.figure not in STORED:
+        parser.error(f"--parts is for {', '.join(STORED)}")
     if args.n is not None and args.figure == "fid" and args.n < 4:
         parser.error("-n of fid is 4 or more")
     return args

@@ -33,7 +33,7 @@ def fid(args: Any) -> Made:
     rows += [realism.planning(row) for row in installed(found, planners.names())]
     first = SPLITS["validation"].start
     each = 1 + max(int(name.rsplit("/", 1)[1]) for name in real) - first
-    wanted = Namespace(n=each, keep=args.keep, report=False, central=False)
+    wanted = Namespace(n=each, keep=args.keep, report=False, parts=None)
     results = runs_of(wanted, [(LEVELS, rows)], "paper_paths", jobs=args.jobs, timeout=LIMIT, split="validation")
     data: dict[str, Any] = {}
     lines, picture = [], blank(10, 4.6)

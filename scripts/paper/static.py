@@ -50,13 +50,13 @@ def runs_of(
 ) -> Results:
     """Return the runs of some rows on the first problems of some levels, one part after the other.
 
-    Missing ones are made, with the argument ``central`` those of the first part alone, with ``report`` none.
+    Missing ones are made, with the argument ``parts`` those of the first so many parts alone, with ``report`` none.
     """
     out, wanted = args.keep / folder, dict[str, str]()
-    for k, (levels, rows) in enumerate(parts):
+    for k, (levels, rows) in enumerate(part for part in parts if part[1]):
         there = jobs_of(levels, rows, runs=args.n, timeout=timeout, seed=0, split=split, simplify=True)
         wanted |= {job.key: job.label for job in there}
-        if not args.report and (k == 0 or not args.central):
+        if not args.report and (args.parts is None or k < args.parts):
             bench(levels, rows, out, runs=args.n, timeout=timeout, workers=Workers(jobs), split=split,
                   provenance=record.session())  # fmt: skip
     found = Results.load(out)
@@ -88,11 +88,11 @@ def evenly(runs: Sequence[Run]) -> list[Run]:
 
 
 def standing(args: Namespace, over_size: bool) -> tuple[tuple[Row, ...], Results]:
-    """Return the rows of all planners, or of those over size, and their runs, the central claim's first."""
-    known, some = planners.names(), PLANNERS[:OVER_SIZE] if over_size else PLANNERS
-    rows, claimed = installed(some, known), [row for row in CLAIMED if not untrained(row)]
-    return rows, runs_of(args, [(LARGEST, claimed), (list(STATIC), rows)] if claimed else [(list(STATIC), rows)],
-                         FOLDER, jobs=args.jobs)  # fmt: skip
+    """Return the rows of all planners, or of those over size, and their runs: the central claim's, then quick ones."""
+    rows = installed(PLANNERS[:OVER_SIZE] if over_size else PLANNERS, planners.names())
+    claimed, quick = [row for row in CLAIMED if not untrained(row)], [row for row in rows if row.timeout is None]
+    parts = [(LARGEST, claimed), (list(STATIC), quick), (list(STATIC), rows)]
+    return rows, runs_of(args, parts, FOLDER, jobs=args.jobs)
 
 
 def failure(args: Namespace) -> Made:
