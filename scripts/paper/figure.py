@@ -100,22 +100,25 @@ def of_runs(results: Results, *, planned: bool = True) -> tuple[Notes, str]:
     commands = dict.fromkeys(f"{one['command']} ({one['jobs']} at a time)" for one in sessions)
     dates = sorted(one["date"][:10] for one in sessions)
     made = [("Commands", "; ".join(commands)), ("Dates", f"{dates[0]} to {dates[-1]}")]
-    made += [("Runs", f"{cost['runs']} of {cost['of']}; CPU time of all {cost['core_hours']:.1f} core-hours, by "
-                      f"{cost['timed']} runs that stored theirs")] if cost["timed"] else []  # fmt: skip
+    if cost["timed"]:
+        made.append(("Runs", f"{cost['runs']} of {cost['of']}; {cost['core_hours']:.1f} core-hours for "
+                      f"{cost['rated']} of them, by the CPU times of {cost['timed']}"))  # fmt: skip
     notes = [("Note", warning) for warning in warnings(results)] if planned else []
     return [*made, *short, ("Commits of the runs", commits), *notes], commits
 
 
 def cost_of(results: Results) -> dict[str, Any]:
-    """Return what a figure takes: runs that are there, and that it asks for, and the CPU time of all [core-hours].
+    """Return what a figure takes: the runs that are there, those that it asks for, and CPU time [core-hours].
 
-    That time is each row's mean CPU time, by the runs that stored theirs (``timed``), times the runs asked for.
+    That time is each row's mean CPU time, of the runs that stored theirs (``timed``), times the runs asked for; of rows
+    with such runs (``rated`` of the runs asked for).
     """
     asked = Counter(results.about.get(ASKED, {}))
     seconds = {label: [run["cpu"] for run in results.runs if run["label"] == label and run.get("cpu") is not None]
                for label in asked}  # fmt: skip
     total = sum(float(np.mean(some)) * asked[label] for label, some in seconds.items() if some)
-    return {"runs": len(results.runs), "of": asked.total(), "timed": sum(map(len, seconds.values())),
+    rated = sum(asked[label] for label, some in seconds.items() if some)
+    return {"runs": len(results.runs), "of": asked.total(), "timed": sum(map(len, seconds.values())), "rated": rated,
             "core_hours": total / 3600.0}  # fmt: skip
 
 

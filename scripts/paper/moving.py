@@ -146,7 +146,7 @@ def imposed(args: Namespace) -> Made:
     A cube comes where there is room for it in the way of the method's own first motion, so that not all runs have one.
     """
     known, parts = methods.names(), [(FREE, brought(LARGEST, CENTRAL_IMPOSED, CENTRAL_LABELS))]
-    parts += [(FREE, installed(brought(size, IMPOSED), known)) for size in SIZES]
+    parts += [(FREE, installed(brought(size, IMPOSED, BROUGHT_IN), known)) for size in SIZES]
     results = runs_of(args, parts, "paper_imposed", jobs=args.jobs, timeout=LIMIT)
     data: dict[str, Any] = {"sizes": {}, "tasks": {}, "again": {}, "cost": cost_of(results)}
     lines: dict[str, list[list[str]]] = {name: [] for name in ("sizes", "tasks", "again")}

@@ -123,9 +123,13 @@ def made_with(results: Results, to: str) -> str:
         versions = ", ".join(f"{library} {version}" for library, version in about["versions"].items())
         commits = about.get("run_commits") or about["commit"]
         cells = [f"[{name}]({to}/{PREFIX}{name}.md)", f"`{about['command']}`", about["date"]]
-        cells += [f"{cost['runs']} of {cost['of']}", f"{cost['core_hours']:.1f}"] if cost else [NONE, NONE]
+        cells += (
+            [f"{cost['runs']} of {cost['of']}", f"{cost['core_hours']:.1f} for {cost['rated']}"]
+            if cost
+            else [NONE, NONE]
+        )
         rows.append([*cells, commits, about["hardware"], f"Python {about['python']}, {versions}"])
-    head = ["result", "command", "date", "runs", "core-hours of all", "commits", "hardware", "versions"]
+    head = ["result", "command", "date", "runs", "core-hours for runs", "commits", "hardware", "versions"]
     return table(head, rows)
 
 

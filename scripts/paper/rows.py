@@ -136,7 +136,7 @@ FREE = tuple(f"{task}/free" for task in TASKS)
 """Levels of the worlds in which a cube is brought in: their problems have no obstacles of their own."""
 
 
-def brought(size: str, runs: int, labels: Sequence[str] = BROUGHT_IN) -> tuple[Row, ...]:
+def brought(size: str, runs: int, labels: Sequence[str]) -> tuple[Row, ...]:
     """Return the rows of replanners in worlds of the kind ``imposed`` with a size of cubes, on ``FREE``."""
     rows = [row for row in METHODS if row.label in labels]
     return tuple(replace(in_loop(f"{row.label}, {size}", row.planner, size=size), runs=runs) for row in rows)

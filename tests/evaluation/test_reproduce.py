@@ -48,7 +48,7 @@ def test_rows_are_those_of_the_registries_and_others_are_left_out_with_a_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rows, "checkpoint", lambda model: ROOT)  # as if it were trained
-    brought = [row for size in SIZES for row in rows.brought(size, 1)]
+    brought = [row for size in SIZES for row in rows.brought(size, 1, rows.BROUGHT_IN)]
     loops = (*rows.METHODS, *rows.SWEEPS, *brought)
     for some, known in ((rows.PLANNERS, planners.names()), (loops, methods.names())):
         assert len({row.label for row in some}) == len(some)
@@ -137,7 +137,7 @@ def test_levels_weigh_alike_whatever_their_numbers_of_runs() -> None:
 def test_the_time_of_a_figure_is_that_of_all_its_runs() -> None:
     runs = [{"label": "a", "cpu": 2.0}, {"label": "a", "cpu": 4.0}, {"label": "b"}]
     results = Results(ROOT, {figure.ASKED: {"a": 1200, "b": 5, "c": 7}}, runs)
-    assert figure.cost_of(results) == {"runs": 3, "of": 1212, "timed": 2, "core_hours": 1.0}
+    assert figure.cost_of(results) == {"runs": 3, "of": 1212, "timed": 2, "rated": 1200, "core_hours": 1.0}
 
 
 def test_duration_and_jerk_are_those_of_the_motion() -> None:
@@ -150,7 +150,7 @@ def test_duration_and_jerk_are_those_of_the_motion() -> None:
 
 
 def test_a_cube_is_brought_in_where_the_row_says_so_and_its_run_tells(robot: Robot) -> None:
-    (row,) = rows.brought("huge", 7, ("blind",))
+    (row,) = rows.brought("huge", 7, ["blind"])
     assert row.runs == 7 and row.label == "blind, huge" and set(rows.FREE) == {"vertical/free", "horizontal/free"}
     for seed, times in ((3, 1), (4, 0)):  # the second has no room for a cube
         problem = f"vertical/free/{900000 + seed}"
@@ -259,7 +259,8 @@ def test_static_figures_are_made_and_resume(args: Namespace, capsys: pytest.Capt
     assert again.data["both, rrtconnect"]["R_f"] == made.data["both, rrtconnect"]["R_f"]
     cell = made.data["vertical, rrtconnect"]
     assert cell["duration_s"] > 0.5 and cell["rms_jerk"] > 1.0
-    assert made.data["cost"] == again.data["cost"] and made.data["cost"]["runs"] == made.data["cost"]["of"] == 4
+    for cost in (made.data["cost"], again.data["cost"]):
+        assert cost["runs"] == cost["of"] == cost["timed"] == 4 and cost["core_hours"] > 0.0
     cells = static.size(args).data  # of the same runs
     assert stored.read_text().splitlines() == resumed and cells["both/small, rrtconnect"]["N"] == 2
 
@@ -313,6 +314,7 @@ def test_dynamic_figures_are_made_and_examples_take_their_runs(
     monkeypatch.setattr(moving, "SIZES", sizes)
     monkeypatch.setattr(moving, "METHODS", (blind, rows.in_loop("later", "no_such_method")))
     monkeypatch.setattr(moving, "SWEEPS", ())
+    monkeypatch.setattr(moving, "CLAIMED_MOVING", ())
     made = moving.dynamic(args)
     made.write("dynamic", args)
     assert {name: cell["N"] for name, cell in made.data["tasks"].items()} == {
@@ -331,6 +333,21 @@ def test_dynamic_figures_are_made_and_examples_take_their_runs(
     assert drawn.data["one"]["world"] == picked["problem"] and drawn.data["none"] is None
     assert drawn.data["one"]["reason"] == picked["reason"], "the same run, bit for bit"
     assert drawn.picture is not None
+
+
+def test_cubes_that_are_brought_in_count_where_there_was_room(args: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(moving, "BROUGHT_IN", ("blind",))
+    monkeypatch.setattr(moving, "CENTRAL_LABELS", ())
+    monkeypatch.setattr(moving, "SIZES", {"huge": SIZES["huge"]})
+    args.n = 4
+    found = moving.imposed(args).data
+    runs = [json.loads(line) for line in (args.keep / "paper_imposed" / "runs.jsonl").read_text().splitlines()]
+    brought = [run for run in runs if run["brought"]]
+    cell = found["sizes"]["huge, blind"]
+    assert len(runs) == cell["worlds"] == found["cost"]["of"] == 8 and 0 < len(brought) == cell["N"] < 8
+    assert cell["R_f"] == pytest.approx(100 * sum(not run["solved"] for run in brought) / len(brought)) != 0.0
+    assert sum(found["tasks"][name]["N"] for name in found["tasks"]) == cell["N"]
+    assert sum(found["again"][name]["N"] for name in found["again"]) == cell["N"]
 
 
 def test_models_and_planners_make_paths_of_the_same_problem(robot: Robot) -> None:
