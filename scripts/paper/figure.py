@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from argparse import Namespace
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -46,7 +47,11 @@ class Made:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def write(self, name: str, args: Namespace) -> None:
-        """Write ``paper_NAME.json``, ``.md`` and ``.png``."""
+        """Write ``paper_NAME.json``, ``.md`` and ``.png``.
+
+        Where runs are missing, cells of the result that is there stay in the JSON file if they have more runs, with
+        their date.
+        """
         text = [
             *(table.markdown() for table in self.tables),
             "\n".join(f"- {key}: {value}" for key, value in self.notes),
@@ -54,11 +59,36 @@ class Made:
         of_runs = {"run_commits": self.commits} if self.commits else {}
         notes = [list(pair) for pair in self.notes]
         settings = {"N": args.n, **self.settings, **of_runs}
-        record.write(f"paper_{name}", {"notes": notes, **self.data}, "\n\n".join(text), args.out, **settings)
+        file, cost = args.out / f"paper_{name}.json", self.data.get("cost")
+        data = dict(self.data)
+        if cost and cost["runs"] < cost["of"] and file.is_file():
+            data = with_older(data, json.loads(file.read_text("utf-8")))
+        record.write(f"paper_{name}", {"notes": notes, **data}, "\n\n".join(text), args.out, **settings)
         if self.picture is not None:
             drawn = io.BytesIO()
             self.picture.savefig(drawn, format="png", dpi=DPI)
             write_atomically(args.out / f"paper_{name}.png", drawn.getvalue())
+
+
+def with_older(cells: Mapping[str, Any], earlier: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the cells of a result with those of an earlier one that have more runs.
+
+    These have the date and the commits of their runs as ``earlier``.
+    """
+    about = earlier.get("about", {})
+    made = f"{about.get('date')}, commits {about.get('run_commits')}"
+
+    def merged(new: Any, old: Any) -> Any:
+        if not isinstance(old, Mapping) or not isinstance(new, Mapping | None):
+            return new
+        if "interval" in old:
+            return new if new is not None and new.get("N", 0) >= old["N"] else {"earlier": made, **old}
+        names = [name for name in {**(new or {}), **old} if name not in ("about", "notes", "cost")]
+        found = {name: merged((new or {}).get(name), old.get(name)) for name in names}
+        return {name: value for name, value in found.items() if value is not None}
+
+    kept: dict[str, Any] = merged(cells, earlier)
+    return kept | {name: cells[name] for name in ("cost",) if name in cells}
 
 
 def blank(width: float, height: float) -> Figure:

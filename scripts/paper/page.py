@@ -13,7 +13,7 @@ from paper.moving import LIMIT
 from paper.published import ENTRIES, PICTURES, RIVALS, Entry, Rival
 from paper.rows import OURS, PACE, PATIENCE
 from paper.static import TIMEOUT
-from paper.table import MISSING, PREFIX, Results, shown, table
+from paper.table import MISSING, PREFIX, Results, dated, shown, table
 
 from apex_ompl.model.guidance import EQUATION_7
 from apex_ompl.moving.compute_costs import cost_table
@@ -30,8 +30,8 @@ FIGURES_SHOWN = (
 def count(*entries: Mapping[str, Any] | None) -> str:
     """Return the numbers of tasks of some entries, each once."""
     there = [entry for entry in entries if entry is not None and "why" not in entry]
-    found = [entry["made"] if "made" in entry else entry.get("N", "?") for entry in there]
-    return ", ".join(dict.fromkeys(map(str, found)))
+    found = [f"{entry['made'] if 'made' in entry else entry.get('N', '?')}{dated(entry)}" for entry in there]
+    return ", ".join(dict.fromkeys(found))
 
 
 def entries(results: Results, some: Sequence[Entry] = ENTRIES) -> str:

@@ -49,6 +49,11 @@ def shown(entry: Mapping[str, Any] | None, number: str) -> str:
     return text
 
 
+def dated(entry: Mapping[str, Any]) -> str:
+    """Return the date of an entry that is of an earlier result than the others, in brackets."""
+    return f" ({entry['earlier'].split(',')[0]})" if "earlier" in entry else ""
+
+
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table."""
     return "\n".join(record.row(list(cells)) for cells in (head, ["---"] * len(head), *rows))

@@ -12,7 +12,7 @@ from math import hypot
 from typing import Any
 
 from paper.rows import FAITHFUL, MOVED_NO_NETWORK, NO_NETWORK, ONE, OURS, UNGUIDED
-from paper.table import MISSING, Results, Where, shown, table
+from paper.table import MISSING, Results, Where, dated, shown, table
 
 from apex_ompl.problems.alignment import SIZES
 
@@ -161,7 +161,9 @@ def by_size(results: Results) -> str:
     for scene in SCENES:
         for size, edge in SIZES.items():
             found = [scene.cell(results, size, row) for row in range(4)]
-            numbers = [text for cell in found for text in (shown(cell, "R_f"), str(cell["N"]) if cell else "")]
+            numbers = [
+                text for cell in found for text in (shown(cell, "R_f"), f"{cell['N']}{dated(cell)}" if cell else "")
+            ]
             points, says = MISSING, told(found[0], found[1])
             if found[0] is not None and found[1] is not None:
                 by, low, high = difference(found[0], found[1])

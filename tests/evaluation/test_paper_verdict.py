@@ -115,3 +115,16 @@ def test_what_was_never_trained_is_said() -> None:
     text = page.entries(Made({key: {"why": "not trained"}}))
     (line,) = [line for line in text.splitlines() if "told sizes, guided" in line]
     assert "| not trained |" in line
+
+
+def test_cells_with_more_runs_stay_until_the_new_ones_are_more() -> None:
+    about = {"date": "2026-11-26", "run_commits": "abc"}
+    old = {"about": about, "notes": [], "cost": {"runs": 1}, "many": cell(1, 16), "few": cell(1, 4),
+           "sizes": {"gone": cell(0, 6) | {"earlier": "2026-11-20, commits x"}}, "text": "old"}  # fmt: skip
+    new = {"cost": {"runs": 2}, "many": cell(0, 8), "few": cell(0, 8), "sizes": {}, "untrained": {"why": "not trained"}}
+    found = figure.with_older(new, old)
+    assert found.keys() == {"cost", "many", "few", "sizes", "untrained"} and found["cost"] == {"runs": 2}
+    assert found["few"] == cell(0, 8) and found["untrained"] == new["untrained"]
+    assert found["many"] == cell(1, 16) | {"earlier": "2026-11-26, commits abc"}
+    assert found["sizes"]["gone"]["earlier"] == "2026-11-20, commits x", "it keeps its date"
+    assert page.count(found["many"], found["few"]) == "16 (2026-11-26), 8"
