@@ -33,8 +33,8 @@ def fid(args: Any) -> Made:
     rows += [realism.planning(row) for row in installed(found, planners.names())]
     first = SPLITS["validation"].start
     each = 1 + max(int(name.rsplit("/", 1)[1]) for name in real) - first
-    wanted = Namespace(n=each, keep=args.keep)
-    results = runs_of(wanted, LEVELS, rows, "paper_paths", jobs=args.jobs, timeout=LIMIT, split="validation")
+    wanted = Namespace(n=each, keep=args.keep, report=False, parts=None)
+    results = runs_of(wanted, [(LEVELS, rows)], "paper_paths", jobs=args.jobs, timeout=LIMIT, split="validation")
     data: dict[str, Any] = {}
     lines, picture = [], blank(10, 4.6)
     for axis, (name, features) in zip(picture.subplots(1, 2), realism.feature_spaces().items(), strict=True):

@@ -2,106 +2,75 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from paper import verdict
 from paper.fid import LIMIT as FID_LIMIT
 from paper.moving import LIMIT
-from paper.published import ENTRIES, PICTURES, RIVALS, Entry, Rival, Where
-from paper.rows import PACE, PATIENCE
+from paper.published import ENTRIES, PICTURES, RIVALS, Entry, Rival
+from paper.rows import OURS, PACE, PATIENCE
 from paper.static import TIMEOUT
+from paper.table import MISSING, PREFIX, Results, dated, shown, table
 
 from apex_ompl.model.guidance import EQUATION_7
 from apex_ompl.moving.compute_costs import cost_table
 from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.util.files import write_atomically
-from benchmarks.lib import record
 
-MISSING, NONE = "not measured yet", ""
-PREFIX = "paper_"
+NONE = ""
 TEMPLATE = Path(__file__).with_name("page_template.md")
-FIGURES_SHOWN = ("time", "failure", "size", "dynamic", "fid", "strips", "failures", "denoising", "diversity")
-
-
-class Results:
-    """The results of the figures in a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        """Read the available results."""
-        self.folder = folder
-        files = {path.stem.removeprefix(PREFIX): path for path in sorted(folder.glob(f"{PREFIX}*.json"))}
-        self.found: dict[str, dict[str, Any]] = {name: json.loads(p.read_text("utf-8")) for name, p in files.items()}
-
-    def entry(self, where: Where) -> Mapping[str, Any] | None:
-        """Return an entry of a result, or None where there is none."""
-        found: Any = self.found
-        for key in where:
-            found = found.get(key) if isinstance(found, dict) else None
-        return found if isinstance(found, dict) else None
-
-
-def shown(entry: Mapping[str, Any] | None, number: str) -> str:
-    """Return a number of an entry, with its interval where it has one."""
-    if entry is None or number not in entry:
-        return MISSING
-    value = entry[number]
-    if value is None:  # not a number: most runs failed
-        return "-"
-    text = f"{value:.1f}" if number == "R_f" else f"{value:.2f}"
-    if "interval" in entry and number in ("R_f", "fid"):
-        low, high = entry["interval"]
-        digits = 1 if number == "R_f" else 2
-        text += f" ({low:.{digits}f} to {high:.{digits}f})"
-    return text
+FIGURES_SHOWN = (
+    "time", "failure", "size", "imposed", "dynamic", "fid", "strips", "failures", "denoising", "diversity",
+)  # fmt: skip
 
 
 def count(*entries: Mapping[str, Any] | None) -> str:
     """Return the numbers of tasks of some entries, each once."""
-    found = [entry["made"] if "made" in entry else entry.get("N", "?") for entry in entries if entry is not None]
-    return ", ".join(dict.fromkeys(map(str, found)))
-
-
-def row(cells: Sequence[str]) -> str:
-    """Return a row of a Markdown table."""
-    return record.row(list(cells))
+    there = [entry for entry in entries if entry is not None and "why" not in entry]
+    found = [f"{entry['made'] if 'made' in entry else entry.get('N', '?')}{dated(entry)}" for entry in there]
+    return ", ".join(dict.fromkeys(found))
 
 
 def entries(results: Results, some: Sequence[Entry] = ENTRIES) -> str:
     """Return the table of the paper's numbers and ours."""
-    lines = [row(["figure", "what", "the paper", "`apex-paper`", "`apex`", "N", "what differs"]), row(["---"] * 7)]
+    rows = []
     for one in some:
         both = [results.entry(where) if where else None for where in (one.faithful, one.ours)]
         ours = [shown(entry, one.number) if where else NONE
                 for entry, where in zip(both, (one.faithful, one.ours), strict=True)]  # fmt: skip
-        lines.append(row([one.figure, one.what, one.paper, *ours, count(*both), one.differs]))
-    return "\n".join(lines)
+        rows.append([one.figure, one.what, one.paper, *ours, count(*both), one.differs])
+    return table(["figure", "what", "the paper", "`apex-paper`", "`apex`", "N", "what differs"], rows)
 
 
 def rivals(results: Results, some: Sequence[Rival] = RIVALS) -> str:
     """Return the table of the algorithms that the paper compares, on both tasks together."""
-    head = [
-        "the paper's",
-        "R_f %",
-        "S_r",
-        "ours",
-        "R_f %, standing",
-        "N",
-        "R_f %, moving",
-        "N",
-        "S_r rad",
-        "what differs",
-    ]
-    lines = [row(head), row(["---"] * len(head))]
+    head = ["the paper's", "R_f %", "S_r", "ours", "R_f %, standing", "N", "beside `apex`", "R_f %, moving", "N",
+            "beside `apex`", "S_r rad", "what differs"]  # fmt: skip
+    best = (("failure", f"both, {OURS}"), ("dynamic", "tasks", f"both, {OURS}"))
+    rows = []
     for one in some:
         static = results.entry(("failure", f"both, {one.static}"))
         moving = results.entry(("dynamic", "tasks", f"both, {one.moving}")) if one.moving else None
-        cells = [one.name, one.ratio, one.smoothness, f"`{one.static}`", shown(static, "R_f"), count(static)]
-        cells += [shown(moving, "R_f") if one.moving else NONE, count(moving), shown(static, "S_r"), one.differs]
-        lines.append(row(cells))
-    return "\n".join(lines)
+        pairs = zip((static, moving), map(results.entry, best), strict=True)
+        beside = [NONE if one.static == OURS else verdict.told(entry, other) for entry, other in pairs]
+        cells = [one.name, one.ratio, one.smoothness, f"`{one.static}`", shown(static, "R_f"), count(static), beside[0]]
+        cells += [shown(moving, "R_f") if one.moving else NONE, count(moving), beside[1]]
+        rows.append([*cells, shown(static, "S_r"), one.differs])
+    return table(head, rows)
+
+
+def motions(results: Results) -> str:
+    """Return the table of smoothness and time of motions among the largest cubes."""
+    rows = []
+    for scene in verdict.SCENES:
+        for k, label in enumerate(scene.labels):
+            cell = scene.cell(results, verdict.LARGEST, k)
+            numbers = [shown(cell, name) for name in ("S_r", "duration_s", "rms_jerk")]
+            rows.append([scene.name, label, *numbers, count(cell)])
+    return table(["largest cubes", "row", "S_r rad", "duration s", "jerk rad/s^3", "N"], rows)
 
 
 def sweeps(results: Results) -> str:
@@ -109,11 +78,11 @@ def sweeps(results: Results) -> str:
     found = results.found.get("dynamic", {}).get("sweeps", {})
     if not found:
         return f"({MISSING}: `python scripts/reproduce.py dynamic`)"
-    lines = [row(["large cubes, moving", "R_f %", "N", "causes"]), row(["---"] * 4)]
+    rows = []
     for label, entry in found.items():
         causes = ", ".join(f"{k} {cause}" for cause, k in entry["causes"].items()) or "-"
-        lines.append(row([label, shown(entry, "R_f"), count(entry), causes]))
-    return "\n".join(lines)
+        rows.append([label, shown(entry, "R_f"), count(entry), causes])
+    return table(["large cubes, moving", "R_f %", "N", "causes"], rows)
 
 
 def distances(results: Results) -> str:
@@ -121,11 +90,11 @@ def distances(results: Results) -> str:
     found = {key.removeprefix("VAE, "): v for key, v in results.found.get("fid", {}).items() if key.startswith("VAE, ")}
     if not found:
         return f"({MISSING}: `python scripts/reproduce.py fid`)"
-    lines = [row(["paths", "FID (95 %)", "floor", "KID", "N", "d"]), row(["---"] * 6)]
+    rows = []
     for label, entry in found.items():
         cells = [label, shown(entry, "fid"), f"{entry['floor']:.2f}", f"{entry['kid']:.4f}", count(entry)]
-        lines.append(row([*cells, str(entry["dimension"])]))
-    return "\n".join(lines)
+        rows.append([*cells, str(entry["dimension"])])
+    return table(["paths", "FID (95 %)", "floor", "KID", "N", "d"], rows)
 
 
 def pictures(results: Results, to: str) -> str:
@@ -145,17 +114,23 @@ def pictures(results: Results, to: str) -> str:
 
 def made_with(results: Results, to: str) -> str:
     """Return the table of how each result was made."""
-    lines = [row(["result", "command", "date", "commits", "hardware", "versions"]), row(["---"] * 6)]
+    rows = []
     for name in FIGURES_SHOWN:
         if name not in results.found:
-            lines.append(row([name, f"`python scripts/reproduce.py {name}`", MISSING, "", "", ""]))
+            rows.append([name, f"`python scripts/reproduce.py {name}`", MISSING, *[NONE] * 5])
             continue
-        about = results.found[name]["about"]
+        about, cost = results.found[name]["about"], results.found[name].get("cost")
         versions = ", ".join(f"{library} {version}" for library, version in about["versions"].items())
         commits = about.get("run_commits") or about["commit"]
-        cells = [f"[{name}]({to}/{PREFIX}{name}.md)", f"`{about['command']}`", about["date"], commits]
-        lines.append(row([*cells, about["hardware"], f"Python {about['python']}, {versions}"]))
-    return "\n".join(lines)
+        cells = [f"[{name}]({to}/{PREFIX}{name}.md)", f"`{about['command']}`", about["date"]]
+        cells += (
+            [f"{cost['runs']} of {cost['of']}", f"{cost['core_hours']:.1f} for {cost['rated']}"]
+            if cost
+            else [NONE, NONE]
+        )
+        rows.append([*cells, commits, about["hardware"], f"Python {about['python']}, {versions}"])
+    head = ["result", "command", "date", "runs", "core-hours for runs", "commits", "hardware", "versions"]
+    return table(head, rows)
 
 
 def text(results: Results, to: str) -> str:
@@ -167,7 +142,9 @@ def text(results: Results, to: str) -> str:
     """
     seconds, loop = cost_table()["seconds"], LoopSettings()
     return TEMPLATE.read_text("utf-8").format(
-        entries=entries(results), rivals=rivals(results), sweeps=sweeps(results), distances=distances(results),
+        verdict="\n".join(f"{k}. {one}" for k, one in enumerate(verdict.sentences(results), 1)),
+        by_size=verdict.by_size(results), motions=motions(results), entries=entries(results),
+        rivals=rivals(results), sweeps=sweeps(results), distances=distances(results),
         pictures=pictures(results, to), made_with=made_with(results, to), trigger=f"{loop.trigger:g}",
         stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", patience=f"{PATIENCE:g}",
         pace=f"{PACE:g}", gamma=EQUATION_7.gamma, active=EQUATION_7.active_below,

@@ -1,4 +1,4 @@
-"""Paths of models and planners beside solutions of the same problems, for FID and KID, and single samples of models."""
+"""Paths of models and planners beside solutions of the same problems, for FID and KID."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from paper import rows
 from tqdm import tqdm
 
 from apex_ompl import problems
@@ -21,9 +22,8 @@ from apex_ompl.evaluation.runs import Run
 from apex_ompl.evaluation.runs import planned as planned_run
 from apex_ompl.model.checkpoint import load_model
 from apex_ompl.model.guidance import GUIDANCES, Guidance
+from apex_ompl.model.proposals import TrajectoryModel
 from apex_ompl.ompl.setup import PlanningSetup, assemble
-from apex_ompl.ompl.validity import full_check
-from apex_ompl.paths.path import path_length
 from apex_ompl.paths.spline import Spline
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.training.autoencoder import Autoencoder
@@ -39,7 +39,11 @@ MODELS = ("apex", "apex-paper")
 DIGITS = 6  # of the control points that are stored
 PROPOSED, PLANNED = "paper.realism:proposed", "paper.realism:planned"
 
-load = cache(load_model)  # once in a process
+
+@cache
+def load(model: str) -> TrajectoryModel:
+    """Return a model that ships, or one that was trained for these figures; once in a process."""
+    return load_model(rows.checkpoint(model) or model)
 
 
 def proposing(model: str, *, guided: bool) -> Row:
@@ -50,7 +54,7 @@ def proposing(model: str, *, guided: bool) -> Row:
 
 def planning(row: Row) -> Row:
     """Return the row of the paths that a planner finds, as it is benchmarked elsewhere, valid ones only."""
-    return replace(row, runner=PLANNED)
+    return replace(row, runner=PLANNED, runs=None)
 
 
 def proposed(job: Job) -> Run:
@@ -75,16 +79,7 @@ def sample(model: str, gamma: float, job: Job) -> tuple[PlanningSetup, Array, fl
 
 def _chosen(model: str) -> Guidance:
     """Return the guidance of a model's paths."""
-    return GUIDANCES["noise" if model == "apex-paper" else "clean"]
-
-
-def one_sample(job: Job) -> Run:
-    """Return the run of one path of apex-paper for a problem: nothing is drawn again where it is invalid."""
-    ready, control, took = sample("apex-paper", job.params["gamma"], job)
-    path = load("apex-paper").spline.path(control)
-    valid = bool(full_check(ready.checker, path, ready.start, list(ready.goals)))
-    length = path_length(path) if valid else None
-    return {"solved": valid, "total": took, "length": length, "raw_length": length}
+    return GUIDANCES["clean" if model == "apex" else "noise"]
 
 
 def planned(job: Job) -> Run:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +19,18 @@ from support import ROOT
 sys.path += [str(ROOT / "scripts"), str(ROOT)]  # as the script has them; the workers of the benchmark inherit them
 
 import reproduce  # noqa: E402
-from paper import examples, figure, moving, page, published, realism, rows, static  # noqa: E402
+from paper import examples, figure, motions, moving, page, published, realism, rows, static, table  # noqa: E402
 
-from apex_ompl import planners, problems  # noqa: E402
-from apex_ompl.evaluation import Row  # noqa: E402
+from apex_ompl import planners, problems, run  # noqa: E402
+from apex_ompl.errors import ParameterError  # noqa: E402
+from apex_ompl.evaluation import Results, Row  # noqa: E402
 from apex_ompl.evaluation.rows import Job, load_runner  # noqa: E402
 from apex_ompl.loop.replan import methods  # noqa: E402
 from apex_ompl.loop.result import Outcome  # noqa: E402
 from apex_ompl.problems.alignment import SIZES  # noqa: E402
 from apex_ompl.robot import Robot  # noqa: E402
+from apex_ompl.timing import Trajectory  # noqa: E402
+from benchmarks.lib import pack  # noqa: E402
 
 RATIO = {"N": 40, "R_f": 12.5, "interval": [5.5, 26.1]}
 
@@ -41,18 +45,26 @@ def test_failure_ratios_have_the_intervals_of_scipy(solved: list[bool]) -> None:
 
 
 def test_rows_are_those_of_the_registries_and_others_are_left_out_with_a_line(
-    capsys: pytest.CaptureFixture[str],
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for some, known in ((rows.PLANNERS, planners.names()), ((*rows.METHODS, *rows.SWEEPS), methods.names())):
+    monkeypatch.setattr(rows, "checkpoint", lambda model: ROOT)  # as if it were trained
+    brought = [row for size in SIZES for row in rows.brought(size, 1, rows.BROUGHT_IN)]
+    loops = (*rows.METHODS, *rows.SWEEPS, *brought)
+    for some, known in ((rows.PLANNERS, planners.names()), (loops, methods.names())):
         assert len({row.label for row in some}) == len(some)
         there = rows.installed(some, known)
         told = {line.partition(": left out, ")[0] for line in capsys.readouterr().out.splitlines()}
         assert told == {row.label for row in some if row.planner not in known}
         assert there == tuple(row for row in some if row.planner in known)
         for row in there:
-            assert row.settings() is not None, "planner, parameters and values are known"
-            assert not row.runner or load_runner(row.runner) in (moving.loop_run, realism.one_sample)
-    assert rows.PLANNERS[0].label == "apex" and all(row.planner == "apex" for row in rows.PLANNERS[: static.OVER_SIZE])
+            assert load_runner(row.runner) in (moving.loop_run, motions.one_sample, motions.timed)
+            if row.runner == rows.TIMED:
+                planners.parameters(row.planner, **row.params)  # they are known, and their values
+    assert rows.PLANNERS[0].label == "apex" and all(row.planner == "apex" for row in rows.PLANNERS[: rows.OVER_SIZE])
+    monkeypatch.setattr(rows, "checkpoint", lambda model: None)
+    sizes = [row for row in rows.PLANNERS if row.params.get("model") == rows.SIZED]
+    assert len(sizes) == 2 and rows.installed(sizes, planners.names()) == ()
+    assert capsys.readouterr().out.count("is not trained") == 2
     known = {f"{suite}/{level}" for suite, levels in problems.suites().items() for level in levels}
     assert set(rows.STATIC) | set(rows.MOVING) <= known
 
@@ -98,6 +110,57 @@ def test_a_strip_is_the_first_world_that_shows_what_guidance_does(
     assert examples.telling(of, contact=contact) == (so[0] if so else 0, len(so))
 
 
+def test_cells_have_the_numbers_of_runs_that_decide() -> None:
+    """The numbers of the issue: 100 a cell of one sample, 200 of apex, 60 moving, 300 in the central claim."""
+    known = {row.label: row for row in rows.PLANNERS}
+    tasks, speeds = len(rows.TASKS), 3
+    for label in (rows.FAITHFUL + rows.ONE, rows.UNGUIDED + rows.ONE):
+        claimed = next(row for row in rows.CLAIMED if row.label == label)
+        assert known[label].runs == 100 and tasks * claimed.runs >= 300
+        assert claimed.params == known[label].params and len(rows.LARGEST) == tasks
+    assert all(tasks * known[label].runs >= 200 for label in (rows.OURS, rows.NO_NETWORK))
+    assert all(tasks * speeds * row.runs >= 60 for row in rows.METHODS)
+    assert len(rows.LARGEST_MOVING) == tasks * speeds
+    assert all(len(rows.LARGEST_MOVING) * row.runs >= 300 for row in rows.CLAIMED_MOVING)
+    assert {rows.FAITHFUL, rows.UNGUIDED, rows.OURS} < {row.label for row in rows.CLAIMED_MOVING}
+    assert tasks * 0.42 * rows.CENTRAL_IMPOSED >= 300, "the share of the largest worlds with room for a cube"
+
+
+def test_levels_weigh_alike_whatever_their_numbers_of_runs() -> None:
+    few = [{"experiment": "a", "seed": k, "solved": False} for k in (2, 0, 1)]
+    many = [{"experiment": "b", "seed": k, "solved": True} for k in range(9)]
+    found = static.evenly([*many, *few])
+    assert sorted((run["experiment"], run["seed"]) for run in found) == [(x, k) for x in "ab" for k in range(3)]
+    assert static.evenly([]) == []
+
+
+def test_the_time_of_a_figure_is_that_of_all_its_runs() -> None:
+    runs = [{"label": "a", "cpu": 2.0}, {"label": "a", "cpu": 4.0}, {"label": "b"}]
+    results = Results(ROOT, {figure.ASKED: {"a": 1200, "b": 5, "c": 7}}, runs)
+    assert figure.cost_of(results) == {"runs": 3, "of": 1212, "timed": 2, "rated": 1200, "core_hours": 1.0}
+
+
+def test_duration_and_jerk_are_those_of_the_motion() -> None:
+    times = np.array([0.0, 1.0, 3.0])  # two joints; jerks (3, 4) for 1 s, then 0 for 2 s
+    a = np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 4.0]])
+    v = np.array([[0.0, 0.0], [1.5, 2.0], [7.5, 10.0]])
+    q = np.array([[0.0, 0.0], [0.5, 2 / 3], [9.5, 38 / 3]])
+    found = motions.smoothness(Trajectory(times, q, v, a, ("one", "two")))
+    assert found == pytest.approx({"duration": 3.0, "rms_jerk": np.sqrt(25.0 / 3.0)})
+
+
+def test_a_cube_is_brought_in_where_the_row_says_so_and_its_run_tells(robot: Robot) -> None:
+    (row,) = rows.brought("huge", 7, ["blind"])
+    assert row.runs == 7 and row.label == "blind, huge" and set(rows.FREE) == {"vertical/free", "horizontal/free"}
+    for seed, times in ((3, 1), (4, 0)):  # the second has no room for a cube
+        problem = f"vertical/free/{900000 + seed}"
+        job = Job("vertical/free", problem, row.label, row.planner, row.params, seed, 30.0, True, row.runner)
+        found = moving.loop_run(job)
+        direct = run(f"imposed/vertical/huge/{900000 + seed}", "blind", speed=rows.PACE, seed=seed)
+        assert found["brought"] == times == len(direct.problem.moving)
+        assert found["outcome"] == direct.outcome and found["duration"] == direct.trajectory.duration
+
+
 def result(folder: Path, where: published.Where, entry: dict[str, Any]) -> None:
     """Write a result, or another entry of it."""
     file = folder / f"paper_{where[0]}.json"
@@ -120,20 +183,20 @@ def test_numbers_of_the_page_come_from_the_results(tmp_path: Path, k: int) -> No
         page.write(tmp_path, tmp_path / "paper.md")
         return (tmp_path / "paper.md").read_text()
 
-    before = page.entries(page.Results(tmp_path)).splitlines()
-    assert page.MISSING in before[k + 2] and one.paper in before[k + 2] and page.MISSING in written()
+    before = page.entries(table.Results(tmp_path)).splitlines()
+    assert table.MISSING in before[k + 2] and one.paper in before[k + 2] and table.MISSING in written()
     for where, value in ((one.faithful, 12.34), (one.ours, 56.78)):
         if where:
             extra = {"fid": {"floor": 0.5, "kid": 0.1, "dimension": 8, "made": 77}}.get(where[0], {"N": 77})
             result(tmp_path, where, {**extra, one.number: value, "interval": [value - 1, value + 1]})
     digits = 1 if one.number == "R_f" else 2
-    line = page.entries(page.Results(tmp_path)).splitlines()[k + 2]
-    assert line in written() and page.MISSING not in line and " 77 " in line
+    line = page.entries(table.Results(tmp_path)).splitlines()[k + 2]
+    assert line in written() and table.MISSING not in line and " 77 " in line
     assert f"{12.34:.{digits}f}" in line and (not one.ours or f"{56.78:.{digits}f}" in line)
     if one.number not in {"S_r", "time_s"}:
         assert f"({11.34:.{digits}f} to {13.34:.{digits}f})" in line
     result(tmp_path, one.faithful, {"N": 77, "floor": 0.5, "kid": 0.1, "dimension": 8, "made": 77, one.number: 43.21})
-    assert f"{43.21:.{digits}f}" in page.entries(page.Results(tmp_path)).splitlines()[k + 2]
+    assert f"{43.21:.{digits}f}" in page.entries(table.Results(tmp_path)).splitlines()[k + 2]
     assert "abc1234" in written() and "2 cores" in written()
 
 
@@ -142,9 +205,9 @@ def test_the_page_has_every_algorithm_and_the_choices_of_the_loop(tmp_path: Path
         result(tmp_path, ("dynamic", "sweeps", label), {**RATIO, "causes": {"hit-moving": 5}})
     for one in published.RIVALS:
         result(tmp_path, ("failure", f"both, {one.static}"), {**RATIO, "S_r": 3.21})
-    text = page.text(page.Results(tmp_path), "results")
+    text = page.text(table.Results(tmp_path), "results")
     for one in published.RIVALS:
-        assert f"| {one.name} | {one.ratio} | {one.smoothness} | `{one.static}` | 12.5 (5.5 to 26.1) | 40 |" in text
+        assert f"| {one.name} | {one.ratio} | {one.smoothness} | `{one.static}` | 12.5 (5.5 to 26.1) | 40 " in text
     assert "| apex-paper, trigger 0.02 m | 12.5 (5.5 to 26.1) | 40 | 5 hit-moving |" in text
     assert {one.static for one in published.RIVALS} <= {row.label for row in rows.PLANNERS}
     assert {one.moving for one in published.RIVALS if one.moving} <= {row.label for row in rows.METHODS}
@@ -154,7 +217,7 @@ def test_the_page_has_every_algorithm_and_the_choices_of_the_loop(tmp_path: Path
 def test_the_page_in_docs_is_that_of_the_results() -> None:
     results = ROOT / "benchmarks" / "results"
     there = (ROOT / "docs" / "paper.md").read_text()
-    assert there == page.text(page.Results(results), "../benchmarks/results"), "python scripts/reproduce.py page"
+    assert there == page.text(table.Results(results), "../benchmarks/results"), "python scripts/reproduce.py page"
 
 
 @pytest.fixture
@@ -163,17 +226,26 @@ def args(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared_process: None) 
     monkeypatch.setattr(sys, "argv", [str(ROOT / "scripts" / "reproduce.py"), "failure"])
     few = {f"{task}/{size}": SIZES.get(size, 0.0) for task in rows.TASKS for size in ("free", "small")}
     monkeypatch.setattr(static, "STATIC", few)
-    monkeypatch.setattr(static, "PLANNERS", (Row("rrtconnect", "rrtconnect"), Row("later", "no_such_planner")))
+    monkeypatch.setattr(static, "PLANNERS", (rows.planner("rrtconnect", "rrtconnect"), Row("later", "no_such_planner")))
     monkeypatch.setattr(static, "OVER_SIZE", 1)
+    monkeypatch.setattr(static, "CLAIMED", ())
     monkeypatch.setattr(static, "TIMED", "small")
-    return Namespace(n=1, jobs=1, keep=tmp_path / "runs", out=tmp_path / "results", page=tmp_path / "paper.md")
+    return Namespace(
+        n=1,
+        jobs=1,
+        parts=None,
+        report=False,
+        keep=tmp_path / "runs",
+        out=tmp_path / "results",
+        page=tmp_path / "paper.md",
+    )
 
 
 def test_static_figures_are_made_and_resume(args: Namespace, capsys: pytest.CaptureFixture[str]) -> None:
     made = static.failure(args)
     made.write("failure", args)
     assert "later: left out, this installation has no no_such_planner" in capsys.readouterr().out
-    stored = args.keep / "paper_figures" / "runs.jsonl"
+    stored = args.keep / static.FOLDER / "runs.jsonl"
     lines = stored.read_text().splitlines()
     assert len(lines) == 4, "two tasks, two levels, one row"
     found = json.loads((args.out / "paper_failure.json").read_text())
@@ -185,15 +257,50 @@ def test_static_figures_are_made_and_resume(args: Namespace, capsys: pytest.Capt
     assert resumed[0] == lines[0], "runs that had ended are not made again"
     assert {json.loads(line)["key"] for line in resumed} == {json.loads(line)["key"] for line in lines}
     assert again.data["both, rrtconnect"]["R_f"] == made.data["both, rrtconnect"]["R_f"]
+    cell = made.data["vertical, rrtconnect"]
+    assert cell["duration_s"] > 0.5 and cell["rms_jerk"] > 1.0
+    for cost in (made.data["cost"], again.data["cost"]):
+        assert cost["runs"] == cost["of"] == cost["timed"] == 4 and cost["core_hours"] > 0.0
     cells = static.size(args).data  # of the same runs
     assert stored.read_text().splitlines() == resumed and cells["both/small, rrtconnect"]["N"] == 2
+
+
+def test_the_central_claim_comes_first_and_packed_runs_resume(
+    args: Namespace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(static, "CLAIMED", (replace(static.PLANNERS[0], runs=2),))
+    monkeypatch.setattr(static, "LARGEST", ("vertical/small",))
+    args.n, args.parts = 9, 1
+    monkeypatch.setattr(static, "PLANNERS", (replace(static.PLANNERS[0], runs=1),))
+    found = static.size(args).data
+    assert found["vertical/small, rrtconnect"]["N"] == found["both/small, rrtconnect"]["N"] == 2
+    assert "horizontal/small, rrtconnect" not in found and "vertical/free, rrtconnect" not in found
+    stored = args.keep / static.FOLDER / "runs.jsonl"
+    before = stored.read_text()
+    assert before.count("\n") == 2, "the runs of the first part alone"
+    monkeypatch.setattr(pack, "RUNS", args.keep)
+    monkeypatch.setattr(pack, "PACKED", tmp_path / "packed")
+    packed = pack.pack(static.FOLDER)
+    args.keep = tmp_path / "clone"  # of another machine
+    monkeypatch.setattr(pack, "RUNS", args.keep)
+    assert {file.name for file in pack.unpack(static.FOLDER)} == {"about.json", "runs.jsonl"}
+    args.report = True
+    assert static.size(args).data == found, "a report makes no run"
+    args.report, args.parts = False, None
+    static.size(args)
+    resumed = (args.keep / static.FOLDER / "runs.jsonl").read_text()
+    assert resumed.startswith(before) and resumed.count("\n") == 5, "one on each of the other three levels"
+    assert pack.pack(static.FOLDER) == packed, "packed again with what was added"
+    with pytest.raises(ParameterError, match="without other runs"):
+        monkeypatch.setattr(pack, "RUNS", stored.parents[1])
+        pack.unpack(static.FOLDER)
 
 
 def test_times_are_those_of_runs_alone(args: Namespace) -> None:
     args.jobs = 2
     made = static.time(args)
     assert made.data["rrtconnect"]["N"] == 2 and made.data["rrtconnect"]["time_s"] > 0.0
-    sessions = json.loads((args.keep / "paper_times" / "about.json").read_text())["sessions"]
+    sessions = json.loads((args.keep / "paper_alone" / "about.json").read_text())["sessions"]
     assert [session["jobs"] for session in sessions] == [1]
 
 
@@ -207,6 +314,7 @@ def test_dynamic_figures_are_made_and_examples_take_their_runs(
     monkeypatch.setattr(moving, "SIZES", sizes)
     monkeypatch.setattr(moving, "METHODS", (blind, rows.in_loop("later", "no_such_method")))
     monkeypatch.setattr(moving, "SWEEPS", ())
+    monkeypatch.setattr(moving, "CLAIMED_MOVING", ())
     made = moving.dynamic(args)
     made.write("dynamic", args)
     assert {name: cell["N"] for name, cell in made.data["tasks"].items()} == {
@@ -225,6 +333,21 @@ def test_dynamic_figures_are_made_and_examples_take_their_runs(
     assert drawn.data["one"]["world"] == picked["problem"] and drawn.data["none"] is None
     assert drawn.data["one"]["reason"] == picked["reason"], "the same run, bit for bit"
     assert drawn.picture is not None
+
+
+def test_cubes_that_are_brought_in_count_where_there_was_room(args: Namespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(moving, "BROUGHT_IN", ("blind",))
+    monkeypatch.setattr(moving, "CENTRAL_LABELS", ())
+    monkeypatch.setattr(moving, "SIZES", {"huge": SIZES["huge"]})
+    args.n = 4
+    found = moving.imposed(args).data
+    runs = [json.loads(line) for line in (args.keep / "paper_imposed" / "runs.jsonl").read_text().splitlines()]
+    brought = [run for run in runs if run["brought"]]
+    cell = found["sizes"]["huge, blind"]
+    assert len(runs) == cell["worlds"] == found["cost"]["of"] == 8 and 0 < len(brought) == cell["N"] < 8
+    assert cell["R_f"] == pytest.approx(100 * sum(not run["solved"] for run in brought) / len(brought)) != 0.0
+    assert sum(found["tasks"][name]["N"] for name in found["tasks"]) == cell["N"]
+    assert sum(found["again"][name]["N"] for name in found["again"]) == cell["N"]
 
 
 def test_models_and_planners_make_paths_of_the_same_problem(robot: Robot) -> None:
@@ -262,7 +385,14 @@ def test_all_goes_on_behind_a_figure_that_fails_and_says_which(
 
 
 def test_the_command_refuses_what_makes_no_sense(monkeypatch: pytest.MonkeyPatch) -> None:
-    for words in (["all", "-n", "3"], ["fid", "-n", "2"], ["no_such_figure"]):
+    for words in (
+        ["all", "-n", "3"],
+        ["strips", "--report"],
+        ["fid", "--parts", "1"],
+        ["size", "--parts", "0"],
+        ["fid", "-n", "2"],
+        ["no_such_figure"],
+    ):
         monkeypatch.setattr(sys, "argv", ["reproduce.py", *words])
         with pytest.raises(SystemExit) as stopped:
             reproduce.parsed()
