@@ -29,7 +29,7 @@ def pack(name: str) -> Path:
     Raises:
         MissingFileError: There are none.
     """
-    files = [file for file in sorted((RUNS / name).glob("*")) if file.suffix in KINDS and file.is_file()]
+    files = [file for file in sorted((RUNS / name).rglob("*")) if file.suffix in KINDS and file.is_file()]
     if not files:
         raise MissingFileError(str(RUNS / name), "runs", "expected a folder, as the benchmarks store them")
     archive = io.BytesIO()

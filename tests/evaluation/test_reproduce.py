@@ -397,3 +397,14 @@ def test_the_command_refuses_what_makes_no_sense(monkeypatch: pytest.MonkeyPatch
         with pytest.raises(SystemExit) as stopped:
             reproduce.parsed()
         assert stopped.value.code == 2
+
+
+def test_runs_in_folders_are_packed_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(pack, "RUNS", tmp_path / "runs")
+    monkeypatch.setattr(pack, "PACKED", tmp_path / "packed")
+    for name in ("tasks/one.json", "worlds/one.json", "worlds/picture.png"):
+        (tmp_path / "runs" / "pairs" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "runs" / "pairs" / name).write_text(name)
+    pack.pack("pairs")
+    monkeypatch.setattr(pack, "RUNS", tmp_path / "clone")
+    assert [file.read_text() for file in pack.unpack("pairs")] == ["tasks/one.json", "worlds/one.json"]
