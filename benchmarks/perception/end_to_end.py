@@ -15,8 +15,8 @@ not planned or not started, for whatever reason, failed.
 Differences of the failure ratio are paired, with intervals of Agresti and Min (2005). Settings were chosen on other
 seeds (tasks 1 to 20, worlds of the split ``validation``). Plans stop by the wall clock: a busy machine finds fewer.
 
-Runs are stored in benchmarks/runs/perception_end_to_end when they end; the command resumes, in another clone after ``python
--m benchmarks.lib.pack unpack perception_end_to_end``.
+Runs are stored in benchmarks/runs/perception_end_to_end when they end; the command resumes, in another clone after
+``python -m benchmarks.lib.pack unpack perception_end_to_end``.
 
 Usage: python -m benchmarks.perception.end_to_end [-n 600] [--parts tasks worlds] [--report]
 """
