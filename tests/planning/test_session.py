@@ -494,7 +494,7 @@ def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> Non
         (ParameterError, "wanted: expected a whole number, 1", lambda: TaskSearch(wanted=0)),
         (
             ParameterError,
-            "goal: expected no object that draws states",
+            "goal: expected no object",
             lambda: planner.sequence(home, [{"kind": "move", "goal": Drawn()}]),
         ),
     )
