@@ -456,8 +456,7 @@ def test_both_arms_are_a_group_without_the_hands(planner: MotionPlanner, robot: 
 
 
 class Drawn:
-    def sample(self, rng: np.random.Generator) -> None:
-        return None
+    sample = None
 
 
 def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> None:
