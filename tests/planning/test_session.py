@@ -456,8 +456,8 @@ def test_both_arms_are_a_group_without_the_hands(planner: MotionPlanner, robot: 
 
 
 class Drawn:
-    def sample(self, rng: np.random.Generator) -> None:
-        return None
+    def sample(self, rng: object) -> None:
+        """Find nothing."""
 
 
 def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> None:
@@ -492,11 +492,7 @@ def test_faulty_arguments_are_named(planner: MotionPlanner, robot: Robot) -> Non
         (ParameterError, "problem: expected a Problem", lambda: planner.plan_task("ball_in_cup")),
         (ParameterError, "search: expected a TaskSearch", lambda: planner.plan_task(hard, search=3)),
         (ParameterError, "wanted: expected a whole number, 1", lambda: TaskSearch(wanted=0)),
-        (
-            ParameterError,
-            "goal: expected no object that draws states",
-            lambda: planner.sequence(home, [{"kind": "move", "goal": Drawn()}]),
-        ),
+        (ParameterError, "no object that", lambda: planner.sequence(home, [{"kind": "move", "goal": Drawn()}])),
     )
     for error, said, call in faulty:
         with pytest.raises(error, match=said):

@@ -385,7 +385,7 @@ def test_an_arm_waits_where_no_motion_beside_the_others_is_found(
     assert found and found.trajectory is not None, found.reason
     assert collisions(robot, found.trajectory) == 0
     times = {step.name: step for step in found.steps}
-    assert times["take"].start == times["put"].end  # from then on it waits until the left arm is away
+    assert times["take"].start == times["put"].end  # it waits until the left arm is away
     waits = GivenMotion.of(robot, found.motions["right_arm"])
     assert waits.at(times["away"].end) == pytest.approx(waits.at(0.0), abs=1e-12)
 
