@@ -1,8 +1,10 @@
 """Makes the tables of clearances of a robot's links, see :mod:`apex_ompl.collision.clearance_tables`.
 
 A table is a grid of cells over the values of one to three joints. Where the exact shapes are not proved apart over a
-whole cell (:mod:`apex_ompl.kernel.compiled.check.box_bound`), it is halved along each axis. Tables are made for pairs
-that the sphere covers leave open at some states, those that are open most often first, and those of three joints last.
+whole cell (:mod:`apex_ompl.kernel.compiled.check.box_bound`), it is halved along each axis. Links with one joint
+between them may be as close as a bearing is at every value of it: small cells need to be proved by THIN alone. Tables
+are made for pairs that the sphere covers leave open at some states, those that are open most often first, and those of
+three joints last.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from apex_ompl.collision.links import Links
 from apex_ompl.collision.tables import joint_tree
 from apex_ompl.kernel.arrays import pack
 from apex_ompl.kernel.box_bound import BoxBounds
-from apex_ompl.kernel.clearance_table import LARGEST, UNIT
+from apex_ompl.kernel.clearance_table import LARGEST, THIN, UNIT
 from apex_ompl.kernel.products import product
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
@@ -154,10 +156,13 @@ class TableMaker:
                     return cells, False
                 middles = np.repeat(middle[None], len(some), axis=0)
                 middles[:, axes] = lower + (some + 0.5) * width
-                bounds = self._bounds_over(pair, middles, half, enough + SAFE)
-                proved = bounds >= enough + SAFE
+                bounds, needed = self._bounds_over(pair, middles, half, enough + SAFE), enough
+                if len(axes) == 1 and level >= HOPELESS[0] and len(near := np.flatnonzero(bounds < enough + SAFE)):
+                    needed, least = THIN, THIN + SAFE
+                    bounds[near] = self.bounds(pair, middles[near], half, least=least, need=least + SAFE)
+                proved = bounds >= needed + SAFE
                 at = tuple(some[proved].T)
-                cells[at] = np.minimum((bounds[proved] - SAFE) / UNIT, LARGEST)
+                cells[at] = np.clip((bounds[proved] - SAFE) / UNIT, 1, LARGEST)
                 left[at] = False
             if not left.any() or (level >= HOPELESS[len(axes) - 1] and not cells.any()):
                 break

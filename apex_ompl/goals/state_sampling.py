@@ -247,6 +247,12 @@ def _combined(states: Array, own: Array, arm: Arm) -> Array:
     return found
 
 
+def _hand_joints(robot: Robot) -> tuple[int, ...]:
+    """Return the places in a state of the joints that close hands."""
+    names = (hand.synergy for hand in robot.hands.values())
+    return tuple(robot.joint_names.index(name) for name in names if name is not None)
+
+
 class AlignmentSampler:
     """Sampler of starts and goals for objects in both hands that are to be aligned; there are no obstacles.
 
@@ -271,7 +277,7 @@ class AlignmentSampler:
         first, second = (body.name for body in self.attached)
         self.tables = self._checker.kernel.robot.without_pair(first, second)
         self.kernel = scene_kernel(robot, self.tables, ())
-        self._inverse = Links.of(robot).inverse(self.goal.targets(), robot.groups["hands"])
+        self._inverse = Links.of(robot).inverse(self.goal.targets(), _hand_joints(robot))
         self._corners = [self._box_corners(body) for body in self.attached]
 
     def _box_corners(self, body: AttachedObject) -> tuple[int, Array]:
@@ -335,7 +341,7 @@ class AlignmentSampler:
     def _around_home(self, rng: np.random.Generator, spread: float) -> Array:
         """Return states home + N(0, spread^2) with the hands as at home, shape (BATCH, dof)."""
         states = self.home + rng.normal(0.0, spread, (BATCH, self.robot.dof))
-        hands = self.robot.groups["hands"]
+        hands = list(_hand_joints(self.robot))
         states[:, hands] = self.home[hands]
         return np.asarray(states)
 

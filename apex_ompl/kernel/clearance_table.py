@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.check.clearance_table import LARGEST, UNIT
+from apex_ompl.kernel.compiled.check.clearance_table import LARGEST, THIN, UNIT
 from apex_ompl.types import Array
 
-__all__ = ["LARGEST", "UNIT", "ClearanceTable", "table_arrays"]
+__all__ = ["LARGEST", "THIN", "UNIT", "ClearanceTable", "table_arrays"]
 
 NO_AXES = ((0.0, 0.0), (0.0, 0.0))
 
@@ -26,7 +26,7 @@ class ClearanceTable:
         lower: Lowest value of each, shape (1,) to (3,) [rad], [m].
         upper: Highest value of each.
         cells: Lower bounds in units of UNIT over cells of equal size, n a power of two along each axis; 0 where the
-            bodies are not proved apart.
+            bodies are not proved apart, 1 for THIN.
     """
 
     joints: tuple[str, ...]

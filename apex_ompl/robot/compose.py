@@ -6,7 +6,7 @@ Each URDF is checked before it is parsed: an error names the element, where the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +41,9 @@ CONTINUOUS = "continuous"
 AT_BASE = ("plane", "along_x", "along_y")  # links of a planar base, from its mount on
 MOVING = (*LIMITED, CONTINUOUS, "planar")  # joints that need an axis
 TYPES = (*MOVING, "fixed", "floating")
+LENGTHS = {"box": ("size",), "cylinder": ("radius", "length"), "sphere": ("radius",), "capsule": ("radius", "length")}
+LEAST_LENGTH = 1e-9  # of shapes [m]
+SIGNS = {0.0: "0 or more", LEAST_LENGTH: "lengths above 0"}
 
 
 def check_urdf(tree: ET.Element, file: Path, locked: Collection[str] = ()) -> None:
@@ -61,11 +64,14 @@ def check_urdf(tree: ET.Element, file: Path, locked: Collection[str] = ()) -> No
             _check_numbers(inertial, POSE, f"{what}: inertial")
             _required(inertial, "mass", ("value",), f"{what}: inertial")
             _required(inertial, "inertia", INERTIA, f"{what}: inertial")
+            _check_signs(inertial, {"mass": ("value",), "inertia": ("ixx", "iyy", "izz")}, f"{what}: inertial")
         for kind in ("visual", "collision"):
             for holder in link.findall(kind):
                 _check_numbers(holder, POSE, f"{what}: {kind}")
                 for geometry in holder.findall("geometry"):
                     _check_numbers(geometry, SIZES, f"{what}: {kind}")
+                    if kind == "collision":
+                        _check_signs(geometry, LENGTHS, f"{what}: {kind}", least=LEAST_LENGTH)
     for joint in tree.findall("joint"):
         _check_joint(joint, f"{file}: joint {joint.get('name')!r}", joint.get("name") in locked)
 
@@ -100,6 +106,15 @@ def _check_numbers(element: ET.Element, known: dict[str, dict[str, int]], what: 
             for attribute, count in attributes.items():
                 if (text := inner.get(attribute)) is not None:
                     numbers(text, count, f"{what}: {name} {attribute}")
+
+
+def _check_signs(element: ET.Element, known: Mapping[str, Sequence[str]], what: str, least: float = 0.0) -> None:
+    for name, attributes in known.items():
+        for inner in element.findall(name):
+            for attribute in attributes:
+                text = inner.get(attribute, "")
+                if any(float(word) < least for word in text.split()):
+                    raise RobotError(f"{what}: {name} {attribute}: expected {SIGNS[least]}, got {text}")
 
 
 def _required(element: ET.Element, name: str, attributes: Collection[str], what: str) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
+import coal
 import numpy as np
 
 from apex_ompl.errors import RobotError
@@ -222,11 +223,13 @@ class Semantics(NamedTuple):
         groups: Group -> names of its joints that have one degree of freedom of their own, parents first.
         states: Name of a state -> joint -> value [rad or m].
         palms: Links that carry end effectors.
+        unknown: Names of links, joints and groups in it that the robot and the SRDF do not have.
     """
 
     groups: dict[str, tuple[str, ...]]
     states: dict[str, dict[str, float]]
     palms: tuple[str, ...]
+    unknown: tuple[str, ...]
 
 
 def read_semantics(file: Path, robot: Description) -> Semantics:
@@ -250,8 +253,24 @@ def read_semantics(file: Path, robot: Description) -> Semantics:
     palms = [one.get("parent_link", "") for one in root.findall("end_effector")]
     return Semantics(
         {name: tuple(joint for joint in order if joint in found) for name, found in groups.items()},
-        states, tuple(palm for palm in palms if palm in robot.links),
+        states, tuple(palm for palm in palms if palm in robot.links), tuple(_unknown(root, robot)),
     )  # fmt: skip
+
+
+def _unknown(root: ET.Element, robot: Description) -> Iterator[str]:
+    """Yield the names in an SRDF that are no links, joints or groups, each once."""
+    links, joints = {*robot.links}, {*robot.joints}
+    virtual = {one.get("name", "") for one in root.findall("virtual_joint")}
+    groups = {one.get("name", "") for one in root.findall("group")}
+    places = (
+        ("group/link", "name", links), ("group/joint", "name", joints | virtual), ("group/chain", "base_link", links),
+        ("group/chain", "tip_link", links), ("group/group", "name", groups), ("group_state", "group", groups),
+        ("group_state/joint", "name", joints | virtual), ("end_effector", "parent_link", links),
+        ("end_effector", "group", groups), ("disable_collisions", "link1", links),
+        ("disable_collisions", "link2", links),
+    )  # fmt: skip
+    named = (one.get(key, "") for path, key, known in places for one in root.findall(path) if one.get(key) not in known)
+    yield from dict.fromkeys(name for name in named if name)
 
 
 def _in_order(robot: Description) -> Iterator[str]:
@@ -277,3 +296,14 @@ def _members(name: str, groups: dict[str, ET.Element], robot: Description, seen:
     for group in groups[name].findall("group"):
         found |= _members(group.get("name", ""), groups, robot, (*seen, name))
     return {joint for joint in found if joint in robot.joints and robot.joints[joint].free}
+
+
+def unreadable_mesh(urdf: str) -> str:
+    """Return a clause on the first collision mesh that Coal cannot read, or an empty string."""
+    for link in ET.fromstring(urdf).findall("link"):
+        for mesh in link.findall("collision/geometry/mesh"):
+            try:
+                coal.MeshLoader().load(mesh.get("filename", "").removeprefix("file://"), np.ones(3))
+            except Exception:
+                return f"the collision mesh of link {link.get('name')!r} cannot be read: {mesh.get('filename')}"
+    return ""

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from apex_ompl.errors import FileFormatError, RobotError, UnknownNameError
 from apex_ompl.robot.compose import compose
 from apex_ompl.robot.config import DATA, HOME, WIDEST, Hand, RobotConfig, read_config, read_disabled_pairs, resolve
+from apex_ompl.robot.description import unreadable_mesh
 from apex_ompl.robot.joint_order import name_back, names_in_order
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
@@ -397,7 +398,9 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
         name_back(model, old)
         geometry = pin.buildGeomFromUrdfString(model, composition.urdf, pin.GeometryType.COLLISION)
     except Exception as error:  # Pinocchio's parser raises several kinds
-        raise RobotError(f"{path}: Pinocchio cannot read the composed URDF ({error})") from error
+        said = " ".join(str(error).split())
+        fault = unreadable_mesh(composition.urdf) or f"Pinocchio cannot read the composed URDF ({said})"
+        raise RobotError(f"{path}: {fault}") from error
     check_geometry(model, geometry, composition.urdf, path)
     order = _state_order(config, model, path)
     disabled, files, pairs_file = list(composition.disabled_pairs), [path, *composition.files], None

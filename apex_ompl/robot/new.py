@@ -29,6 +29,7 @@ SUFFIX = ".robot.yaml"
 SAMPLES = 1000  # random states of the search for pairs that always touch, and for a home
 OFTEN = 0.02  # share of states from which a pair that touches is named
 PLACE = "x,y,z,yaw, finite numbers [m, rad]"  # as --at expects it
+NAMED = 5  # unknown names of an SRDF that a note has
 NUMBERS = ("dual", "three", "four", "five", "six")
 
 
@@ -259,6 +260,10 @@ class _Writer:
             record["orientation"] = [0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0)]
         self.data["parts"].append(record)
         state: dict[str, float] = {}
+        if part.semantics is not None and part.semantics.unknown:
+            some, more = part.semantics.unknown[:NAMED], len(part.semantics.unknown) - NAMED
+            names = ", ".join(some) + f" and {more} more" * (more > 0)
+            self.notes.append(f"{part.source.srdf} names what the URDF does not have: {names}")
         for arm in part.arms:
             self._add_arm(part, arm)
             title, values = guesses.preferred_state(part.semantics, arm.joints)

@@ -18,7 +18,7 @@ from apex_ompl.collision.solids import transform
 from apex_ompl.collision.tables import joint_tree
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import Kernel
-from apex_ompl.kernel.clearance_table import UNIT
+from apex_ompl.kernel.clearance_table import THIN, UNIT
 from apex_ompl.robot import Robot
 
 
@@ -111,7 +111,8 @@ def test_a_proved_cell_is_free_and_as_far_as_it_says(tabled: Robot) -> None:
         states = tabled.random_state(rng, 1500)
         values = states[:, list(pair.sources)]
         places = np.floor((values - table.lower) / (table.upper - table.lower) * n).astype(int)
-        bounds = table.cells[tuple(places.T)] * UNIT
+        values = table.cells[tuple(places.T)]
+        bounds = np.where(values == 1, THIN, values * UNIT)
         distances = np.array([distance(tabled, pair.links, q) for q in states])
         assert (bounds <= np.maximum(distances, 0.0) + 1e-9).all()
         assert (bounds[distances > 0.01] > 0.0).mean() > 0.95  # what is clearly free is proved
@@ -258,3 +259,28 @@ def test_a_table_with_another_number_of_axes_than_joints_is_refused(folder: Path
 def test_the_robot_of_the_tables_is_planned_for_with_them(tabled: Robot) -> None:
     arrays = CollisionChecker(tabled).kernel.robot.arrays
     assert (arrays.bodies_table >= 0).sum() == len(arrays.table_cells) >= 3
+
+
+@pytest.mark.parametrize("gap", [5e-5, 5e-6, -1e-5])
+def test_links_that_are_as_close_as_a_bearing_are_proved_apart_by_little(tmp_path: Path, gap: float) -> None:
+    """Two disks that turn on each other keep the same distance at every angle: .05 mm is proved, .005 mm is not."""
+    disk = '<collision><geometry><cylinder radius="0.05" length="0.1"/></geometry></collision>'
+    (tmp_path / "disks.urdf").write_text(
+        f'<robot name="disks"><link name="low">{disk}</link><link name="high">{disk}</link><joint name="turn" '
+        f'type="revolute"><parent link="low"/><child link="high"/><origin xyz="0 0 {0.1 + gap}"/><axis xyz="0 0 1"/>'
+        '<limit lower="-2" upper="2" velocity="1" effort="1"/></joint></robot>'
+    )
+    (tmp_path / "disks.robot.yaml").write_text(
+        "schema: apex-ompl/robot/1\nname: disks\nparts: [{name: disks, urdf: disks.urdf}]\n"
+        "joints: {turn: {home: 0.0, acceleration: 1, jerk: 9}}\n"
+    )
+    robot = load_robot(tmp_path / "disks.robot.yaml")
+    made = make_clearances(robot, 20.0)
+    if gap < THIN:
+        assert not made
+        return
+    (cells,) = made.values()
+    assert (cells == 1).all() and prepare_clearances(robot, 20.0) is not None
+    checker, states = CollisionChecker(load_robot(tmp_path / "disks.robot.yaml")), np.linspace(-2, 2, 101)[:, None]
+    assert (checker.kernel.unproved(states)[1] == 0).all() and checker.kernel.proves(np.array([[-2.0], [2.0]]), 0.01)
+    assert (checker.kernel.clearance(states, 0.01)[:, 1] <= gap + 1e-9).all()  # .01 mm, and not the .1 mm of a unit

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import lzma
+import runpy
 import shutil
 from pathlib import Path
 
@@ -219,3 +220,14 @@ def test_only_frozen_problems_have_witnesses() -> None:
             problems.witness(name)
     with pytest.raises(UnknownNameError, match="train"):
         problems.frozen_names("swap", "easy", "train")
+
+
+@pytest.mark.parametrize("name", ["shelf/tray/900000", "clutter/tray/900000", "shelf/level/900000"])
+def test_the_script_checks_witnesses_under_constraints_on_them(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are stored in steps of .1 mrad, which leave a limit by a last bit, and a closed chain by more."""
+    fault = runpy.run_path(str(ROOT / "scripts" / "check_frozen.py"))["fault"]
+    assert fault(name) == ""
+    path = problems.witness(name).path.copy()
+    path[len(path) // 2] = 2.0  # elbows over their limits, hands in each other
+    monkeypatch.setattr(problems, "witness", lambda name: frozen.Witness(path))
+    assert fault(name) != ""

@@ -29,6 +29,25 @@ FAULTS: dict[str, tuple[dict[str, str], str]] = {
     "words": ({'size="0.2 0.2 0.2"': 'size="wide"'}, "link 'stand': collision: box size"),
     "turned limits": ({'lower="-2"': 'lower="5"'}, "joint 'joint1': limit: expected lower <= upper, got 5 and 2"),
     "negative velocity": ({'velocity="2"': 'velocity="-2"'}, "joint 'joint1': limit: .* not negative, got -2"),
+    "unreadable mesh": (
+        {'<box size="0.06 0.06 0.2"/>': '<mesh filename="toy.srdf"/>'},
+        "mesh of link 'part1' cannot be read: .*toy.srdf",
+    ),
+    "mesh without triangles": (
+        {'<box size="0.06 0.06 0.2"/>': '<mesh filename="points.obj"/>'},
+        "mesh of link 'part1' cannot be read: .*points",
+    ),
+    "flat mesh": ({'<box size="0.06 0.06 0.2"/>': '<mesh filename="flat.obj"/>'}, "link 'part1' has vertices that all"),
+    "no encoding": ({}, "not valid XML"),
+    "negative size": (
+        {'size="0.2 0.2 0.2"': 'size="0.2 0.2 -0.2"'},
+        "link 'stand': collision: box size: expected leng",
+    ),
+    "negative mass": (
+        {'link name="part1">': 'link name="part1">{inertial}'},
+        "link 'part1': .* mass value: .* 0 or more",
+    ),
+    "NaN limit": ({'lower="-2"': 'lower="nan"'}, "joint 'joint1': limit lower: expected a number, got 'nan'"),
     "zero axis": ({'axis xyz="0 0 1"': 'axis xyz="0 0 0"'}, "joint 'joint1': axis xyz: expected a direction"),
     "unknown type": ({'type="revolute"': 'type="hinge"'}, "joint 'joint1': type: expected one of .* got 'hinge'"),
     "mimics nobody": ({'mimic joint="grip1"': 'mimic joint="grap"'}, "joint 'grip2' mimics 'grap'"),
@@ -46,15 +65,21 @@ LOOP = (
     '<link name="a"/><link name="b"/><joint name="ab" type="fixed"><parent link="a"/><child link="b"/></joint>'
     '<joint name="ba" type="fixed"><parent link="b"/><child link="a"/></joint>'
 )
+INERTIAL = '<inertial><mass value="-1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 WHOLE = {"no joints": '<robot><link name="a"/></robot>', "no links": "<robot/>", "empty": "", "no arm": None}
 
 
 def write_faulty(folder: Path, name: str) -> Path:
     """Write a URDF with a fault."""
     urdf = write_toy(folder, FAULTS[name][0])
-    text = urdf.read_text().replace("{loop}", LOOP)
+    (folder / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
+    (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    text = urdf.read_text().replace("{loop}", LOOP).replace("{inertial}", INERTIAL)
     if name == "no arm":
         text = text.replace('name="joint', 'name="leg_')
+    if name == "no encoding":
+        urdf.write_bytes(text.encode().replace(b"toy", b"t\xff"))
+        return urdf
     urdf.write_text(WHOLE.get(name) if WHOLE.get(name) is not None else text)
     return urdf
 
@@ -238,6 +263,18 @@ def test_limbs_are_found_without_fingers_and_legs(tmp_path: Path) -> None:
     found = arms_of(read_description(tmp_path / "h.urdf"), None)
     assert [arm.group for arm in found] == ["left_arm", "right_arm"] and {len(arm.joints) for arm in found} == {5}
     assert found[0].palm == "left_arm4" and found[1].palm == "right_arm4"
+
+
+def test_names_of_an_srdf_that_a_urdf_lacks_are_noted(tmp_path: Path) -> None:
+    urdf = write_toy(tmp_path)
+    text = SRDF.replace('link2="part1"', 'link2="part9"').replace('group="gripper"/>', 'group="claw"/>')
+    (tmp_path / "off.srdf").write_text(
+        text.replace('<joint name="joint4" value="0.7"/>', '<joint name="j9" value="0"/>')
+    )
+    made = new_robot(sources_of([str(urdf)], [str(tmp_path / "off.srdf")]), tmp_path / "a.robot.yaml")
+    assert any(note.endswith("off.srdf names what the URDF does not have: j9, claw, part9") for note in made.notes)
+    same = new_robot(sources_of([str(urdf)], [str(tmp_path / "toy.srdf")]), tmp_path / "b.robot.yaml")
+    assert not any("does not have" in note for note in same.notes)
 
 
 def test_groups_of_three_joints_are_arms_where_an_srdf_says_so(tmp_path: Path) -> None:

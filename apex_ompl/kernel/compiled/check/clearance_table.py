@@ -1,10 +1,10 @@
 """Tables of lower bounds of the distance of two bodies whose relative pose depends on one to three planned joints.
 
 A table is a grid of cells over the values of these joints, 2^L along each axis. Each cell holds a lower bound of the
-distance for all values in it, in units of UNIT, as one byte; 0 where the bodies are not proved apart. Coarser grids
-follow, each with half as many cells along each axis, whose cells hold the least value of those that they consist of.
-A box of joint values is looked up in the finest grid of which it meets at most ACROSS cells along each axis. The cells
-of a continuous joint are those of a whole turn, which repeat.
+distance for all values in it, in units of UNIT, as one byte; 0 where the bodies are not proved apart, and 1 where they
+are, by THIN at least: bearings are so near. Coarser grids follow, each with half as many cells along each axis, whose
+cells hold the least value of those that they consist of. A box of joint values is looked up in the finest grid of which
+it meets at most ACROSS cells along each axis. The cells of a continuous joint are those of a whole turn, which repeat.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from apex_ompl.kernel.compiled.compilation import inlined, outlined
 from apex_ompl.kernel.compiled.layout import Floats
 
 UNIT = 1e-4  # of the bounds [m]
+THIN = 1e-5  # bound that 1 stands for [m]
 LARGEST = 255  # bound in these units
 ACROSS = 4  # most cells along an axis that are read
 MOST_CELLS = 1e9  # from the first one, of a continuous joint
@@ -24,6 +25,11 @@ MOST_CELLS = 1e9  # from the first one, of a continuous joint
 @inlined
 def _value(t: RobotArrays, place: int) -> int:
     return int((t.table_bytes[place >> 3] >> ((place & 7) << 3)) & 255)
+
+
+@inlined
+def _bound(value: int) -> float:
+    return UNIT * value if value > 1 else THIN * value
 
 
 @inlined
@@ -86,7 +92,7 @@ def clearance_of_cell(t: RobotArrays, k: int, q: Floats) -> float:
         if not 0.0 <= at < n:  # NaN is in no cell
             return 0.0
         place = place * n + int(at)
-    return UNIT * _value(t, t.table_cells[e, 0] + place)
+    return _bound(_value(t, t.table_cells[e, 0] + place))
 
 
 @outlined
@@ -118,4 +124,4 @@ def clearance_of_box(t: RobotArrays, k: int, q: Floats, half_width: Floats) -> f
             place = first + ((i & (n - 1)) * rows + (j & (rows - 1))) * columns
             for m in range(f, g + 1):
                 least = min(least, _value(t, place + (m & (columns - 1))))
-    return UNIT * least
+    return _bound(least)
