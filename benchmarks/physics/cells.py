@@ -33,7 +33,7 @@ def main() -> None:
     parser = record.parser(__doc__ or "", n=20, of="cells of a kind, each with a start of its own")
     parser.add_argument("--first", type=whole_number, default=1000, help="first seed (default: %(default)s)")
     parser.add_argument("--kind", action="append", choices=cells.names(), default=[])
-    parser.add_argument("--place", type=float, nargs="*", default=[0.0, 0.005], help="distances of objects [m]")
+    parser.add_argument("--place", type=float, nargs="*", default=[0.0], help="distances of objects [m]")
     parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="draw runs that fail into it, as they end")
     given = parser.parse_args()
     for folder in filter(None, (FOLDER, given.pictures)):
