@@ -51,9 +51,9 @@ IN_LOOP = (FAITHFUL, UNGUIDED, OURS, MOVED_NO_NETWORK)
 SCENES = (
     Scene("standing", "standing cubes", "size", ("size", "both/"),
           (f"{FAITHFUL}{ONE}", f"{UNGUIDED}{ONE}", OURS, NO_NETWORK), (6.56, 67.19)),
-    Scene("brought in", "cubes that are brought into the way, and stand", "imposed", ("imposed", "sizes", ""),
+    Scene("brought in", "cubes that are brought in and stand", "imposed", ("imposed", "sizes", ""),
           IN_LOOP, (9.36, 98.45)),
-    Scene("passing", "cubes that pass, whatever the robot does", "dynamic", ("dynamic", "sizes", ""), IN_LOOP,
+    Scene("passing", "cubes that pass whatever the robot does", "dynamic", ("dynamic", "sizes", ""), IN_LOOP,
           (9.36, 98.45)),
 )  # fmt: skip
 """In the order of the sentences. The paper does not say which of the last two its moving obstacles are."""
@@ -93,7 +93,7 @@ def sentences(results: Results) -> list[str]:
 
 def guidance(results: Results, scene: Scene) -> str:
     """Return the sentence on what guidance does among the largest cubes of a kind."""
-    title = f"**Largest {scene.what}**"
+    title = f"**Largest {scene.what}{', one sample' if scene.labels[0].endswith(ONE) else ''}**"
     guided, unguided = (scene.cell(results, LARGEST, row) for row in (0, 1))
     if guided is None or unguided is None:
         return f"{title}: {unmeasured(scene)}."
@@ -120,7 +120,7 @@ def where(results: Results) -> str:
             by_order.setdefault(found, []).append(f"{100 * edge:.0f}")
         says = {"lower": "it helps at", "higher": "it harms at", UNDECIDED: f"{UNDECIDED} at", MISSING: f"{MISSING} at"}
         sizes = ", ".join(f"{says[key]} {', '.join(some)} cm" for key, some in by_order.items())
-        parts.append(f"among {scene.what} {sizes}")
+        parts.append(f"among {scene.what}, {sizes}")
     return f"**Where guidance helps**: {'; '.join(parts)}."
 
 
@@ -133,7 +133,9 @@ def ours(results: Results) -> str:
             parts.append(f"among {scene.what} {unmeasured(scene)}")
             continue
         beside = {"lower": "less than", "higher": "more than", UNDECIDED: f"{UNDECIDED} whether less than"}
-        text = f"among the largest {scene.what} it fails in {of(own)}, {beside[order(own, guided)]} guided `{FAITHFUL}`"
+        text = (
+            f"among the largest {scene.what}, it fails in {of(own)}, {beside[order(own, guided)]} guided `{FAITHFUL}`"
+        )
         if bare is not None:
             says = {"lower": "the network helps", "higher": "the network harms",
                     UNDECIDED: f"{UNDECIDED} whether the network helps"}  # fmt: skip

@@ -101,7 +101,7 @@ def test_the_sentence_of_sizes_and_that_of_apex_follow_their_cells() -> None:
     cells = standing(cell(5, 100), cell(80, 100), "small") | standing(cell(50, 100), cell(60, 100), "huge")
     cells |= {("size", "both/huge, apex"): cell(0, 200), ("size", "both/huge, apex, no network"): cell(40, 200)}
     told = verdict.sentences(Made(cells))
-    assert "among standing cubes it helps at 6 cm, not measured yet at 10, 15, 20 cm, not decided at 30 cm;" in told[3]
+    assert "among standing cubes, it helps at 6 cm, not measured yet at 10, 15, 20 cm, not decided at 30 cm;" in told[3]
     assert "less than guided `apex-paper`, and without its network in 20.0 %" in told[4]
     assert "the network helps" in told[4] and "whether the network helps" not in told[4]
     lines = verdict.by_size(Made(cells)).splitlines()
