@@ -38,7 +38,9 @@ def context_of(problem: Problem, settings: LoopSettings, speed: float, seed: int
         kept = f"the {setup.constraints.names[0]} along the path"
         raise ParameterError("problem", kept, "no constraint: replanned motions would not keep it")
     limits = Timing(velocity_scale=speed).limits(setup.robot.limits, setup.robot.joint_names)
-    return RunContext(setup, _within(limits), _within(setup.robot.limits), settings)
+    found = RunContext(setup, _within(limits), _within(setup.robot.limits), settings)
+    assert found.torques is None or found.torques.robot is setup.robot  # or it raises
+    return found
 
 
 def work_of(context: RunContext, method: str | Replanner, seed: int) -> Work:

@@ -17,7 +17,7 @@ from apex_ompl.moving.settings import LoopSettings
 from apex_ompl.moving.stopping import stop, stop_along, stops_proved
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.robot.model import Limits
-from apex_ompl.timing import Trajectory
+from apex_ompl.timing import MotionLimits, Timing, Trajectory
 from apex_ompl.timing.checks import SAME_STATE
 from apex_ompl.timing.timed_spline import Start
 from apex_ompl.timing.trajectory import joined
@@ -25,6 +25,7 @@ from apex_ompl.types import Array
 
 SAME_TIME = 1e-9  # [s]
 GRAZING = 1e-4  # distance from still things and own parts, such as held objects, below which a motion is not taken [m]
+TORQUE_SAMPLES = 3  # samples of a motion for each of its knots, as the check of its torques costs
 LIKE_ENDS = 0.5  # share of the clearance at its start or end that a motion keeps, where that is below the margin
 
 
@@ -135,6 +136,16 @@ class RunContext:
         """The kernel."""
         return self.setup.checker.kernel
 
+    @cached_property
+    def torques(self) -> MotionLimits | None:
+        """Limits of torques with what the robot holds, or None where there are none.
+
+        Raises:
+            RobotError: Torques are limited, and no link has a mass.
+        """
+        problem = self.setup.problem
+        return Timing().motion_limits(self.setup.robot, problem.attached, problem.payload)
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the joints."""
@@ -156,8 +167,9 @@ class RunContext:
         return bool(len(self.goals)) and bool((np.abs(self.goals - q).max(axis=1) <= SAME_STATE).any())
 
     def clear_of_static(self, motion: Trajectory, budget: ComputeBudget | None = None) -> bool:
-        """Whether a motion keeps the limits, and is clear by :meth:`is_clear`."""
-        return self.keeps_limits(motion) and self.is_clear(curve_of(motion), budget)
+        """Whether a motion keeps the limits, those of torques too, and is clear by :meth:`is_clear`."""
+        clear = self.keeps_limits(motion) and self.is_clear(curve_of(motion), budget)
+        return clear and self.keeps_torques(motion, budget)
 
     def is_clear(self, curve: Curve, budget: ComputeBudget | None = None) -> bool:
         """Whether a curve is proved clear of static obstacles and of self-collision.
@@ -197,6 +209,17 @@ class RunContext:
     def keeps_limits(self, motion: Trajectory) -> bool:
         """Whether a motion keeps the limits."""
         return max(motion.use(self.limits).values()) <= 1.0 + 1e-9
+
+    def keeps_torques(self, motion: Trajectory, budget: ComputeBudget | None = None) -> bool:
+        """Whether a motion keeps the limits of torques, where there are any.
+
+        A motor that is asked for more falls behind, and the robot leaves the motion that is proved.
+        """
+        if self.torques is None:
+            return True
+        if budget is not None:
+            budget.spend("sample of a motion", TORQUE_SAMPLES * len(motion.times))
+        return not self.torques.fault(motion)
 
     def first_conflict(
         self,
