@@ -28,12 +28,14 @@ from apex_ompl.perception.tracking import ObstacleTracker, TrackedObstacle, Trac
 from apex_ompl.perception.twin_camera import TwinCamera
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
+from apex_ompl.types import Array
+from apex_ompl.util.arrays import bounding_box
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_number, check_positive, check_seed
 
 WIDTH = 320  # of the default cameras [pixels]
 LOW, HIGH = (-0.8, -1.2, -0.05), (1.5, 1.2, 1.6)  # corners of the space beyond which no obstacle counts [m]
-SPREAD = 0.03  # by which held objects are larger, whose red pixels are no obstacle [m]
+SPREAD = 0.01  # by which held objects are larger, in which no obstacle has its center [m]
 TURNING = TrackerSettings(births=1, of=1, longest=3.0, gate=25.0, power=0.2, margin=1.0, slack=0.004)
 """Settings of obstacles that may turn around between two frames."""
 EARLY = 1e-6  # of a frame [s]
@@ -77,7 +79,7 @@ class CameraSensor:
         self._finder, self.tracker = ObstacleFinder(obstacles), ObstacleTracker(tracker)
         self.tracked: tuple[TrackedObstacle, ...] = ()
         self._surface, self._registration = RobotSurface(robot), registration or RegistrationSettings()
-        self._radii = [body_surface(one).radius + SPREAD for one in self.attached]
+        self._boxes = [_box_of(one) for one in self.attached]
         self._next = -np.inf
 
     __repr__ = fields_line
@@ -101,9 +103,8 @@ class CameraSensor:
                 raise ParameterError("eyes", f"{frame.camera.name!r} without colors", "frames with colors")
             stamp = max(stamp, frame.stamp)
             given = corrected(frame, self._surface, self._registration)
-            links = [self.robot.link_pose(given.registration.state, one.link) @ one.pose for one in self.attached]
-            balls = [(pose[:3, 3], radius) for pose, radius in zip(links, self._radii, strict=True)]
-            found = self._finder.find(given, frame.color, balls)
+            held = [self.robot.link_pose(given.registration.state, one.link) @ one.pose for one in self.attached]
+            found = [one for one in self._finder.find(given, frame.color) if not self._is_held(one.pose[:3, 3], held)]
             self.tracked = self.tracker.update(stamp, found, given)
             gone += self.tracker.gone
             seen |= {one.name for one in self.tracked if one.observed is not None}
@@ -117,10 +118,28 @@ class CameraSensor:
         solids, received = tuple(one.solid for one in there), stamp + self.latency
         return Observation(stamp, received, solids, errors, tuple(dict.fromkeys(gone)), bounds=True)
 
+    def _is_held(self, center: Array, held: Sequence[Array]) -> bool:
+        """Whether a center is in a held object, which may have the color of obstacles, too.
+
+        Args:
+            center: Shape (3,) [m].
+            held: Poses of the held objects, shape (4, 4) [m].
+        """
+        places = [pose[:3, :3].T @ (center - pose[:3, 3]) for pose in held]
+        return any(
+            ((low <= place) & (place <= high)).all() for place, (low, high) in zip(places, self._boxes, strict=True)
+        )
+
     def close(self) -> None:
         """Release what draws the images."""
         for eye in self.eyes:
             getattr(eye, "close", tuple)()
+
+
+def _box_of(one: AttachedObject) -> Array:
+    """Return the box around a held object in its frame, shape (2, 3) [m]."""
+    found: Array = bounding_box(body_surface(one).vertices) + np.array([[-SPREAD], [SPREAD]])
+    return found
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from apex_ompl.loop.cycle import unexpected
 from apex_ompl.loop.tracking import Tracker
 from apex_ompl.perception import Frame
 from apex_ompl.perception.rig import Eye, default_cameras
+from apex_ompl.perception.surfaces import body_surface
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.problems.worlds import ScriptedEnvironment, environment_of
 
@@ -128,6 +129,24 @@ def test_names_of_cameras_are_their_own(kernel: Any = None) -> None:
     tracker.tracks["seen_1"] = Track()  # type: ignore[assignment]
     assert unexpected(tracker, [CUBE], 0.0)
     assert not unexpected(tracker, [CUBE], 0.0, named=False)
+
+
+def test_a_cube_beside_a_held_object_is_seen_and_a_center_in_the_object_is_no_obstacle() -> None:
+    still = problems.load(PROBLEM).still
+    one, q = still.attached[0], still.start_state(robot().joint_names)
+    pose = robot().link_pose(q, one.link) @ one.pose
+    reach, found, driver = np.abs(body_surface(one).vertices).max(axis=0), 0, KinematicDriver(robot(), q)
+    for along in (*np.eye(3)[:2], *-np.eye(3)[:2]):
+        place = pose[:3, 3] + pose[:3, :3] @ along * (np.abs(along) @ reach + 0.051)
+        cube = CUBE.model_copy(update={"box": (0.1, 0.1, 0.1), "position": tuple(map(float, place))})
+        sensor = Cameras()(driver, world(cube))
+        seen = sensor.read(0.0)
+        assert seen is not None
+        found += any(np.linalg.norm(np.subtract(o.position, place)) < 0.03 for o in seen.seen)
+        held = [robot().link_pose(q, o.link) @ o.pose for o in still.attached]
+        assert not sensor._is_held(place, held)
+    assert found >= 3
+    assert sensor._is_held(pose[:3, 3], held)
 
 
 def test_faulty_cameras_are_refused() -> None:
