@@ -141,7 +141,8 @@ def straight(search: Search, goal: Array) -> Trajectory | None:
     start, limits, names = search.start, search.context.limits, search.context.names
     search.budget.spend("straight motion")
     if not (start.velocity.any() or start.acceleration.any()):
-        return time_path(np.stack([start.position, goal]), limits, names).trajectory
+        ends = np.stack([start.position, goal])
+        return time_path(ends, limits, names, motion_limits=search.context.torques).trajectory
     return _stretched(search, np.linspace(start.position, goal, STRAIGHT), goal)
 
 

@@ -83,7 +83,8 @@ def timed(search: Search, path: Array, clear: Clearances) -> Trajectory | None:
     if budget.spent + cost_table()["seconds"][kind] > budget.limit:
         return None
     budget.spend(kind)
-    return time_path(short, search.context.limits, search.context.names, Timing(deviation=DEVIATION)).trajectory
+    context, timing = search.context, Timing(deviation=DEVIATION)
+    return time_path(short, context.limits, context.names, timing, motion_limits=context.torques).trajectory
 
 
 @dataclass(frozen=True, eq=False)

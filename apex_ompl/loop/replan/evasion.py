@@ -99,7 +99,8 @@ def _to(search: Search, state: Array) -> Trajectory | None:
         return search.direct(state)
     search.budget.spend("straight motion")
     states = np.stack([search.start.position, state])
-    return time_path(states, search.context.limits, search.context.names).trajectory
+    context = search.context
+    return time_path(states, context.limits, context.names, motion_limits=context.torques).trajectory
 
 
 def _clearances(search: Search, states: Array, looks: Array) -> tuple[Array, Array]:
@@ -150,7 +151,8 @@ def wait_nearer(search: Search) -> Trajectory | None:
             return None
         search.budget.spend("straight motion")
         try:
-            motion = time_path(np.stack([q, state]), context.limits, context.names).trajectory
+            states = np.stack([q, state])
+            motion = time_path(states, context.limits, context.names, motion_limits=context.torques).trajectory
         except ApexError:
             continue
         if search.accepts(motion):

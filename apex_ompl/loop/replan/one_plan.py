@@ -39,7 +39,8 @@ def timed(search: Search, states: Array) -> Trajectory | None:
     """Return a motion from rest to rest along states, shape (N, dof), or None where none is found."""
     search.budget.spend("straight motion" if len(states) == 2 else "path in time")
     try:
-        return time_path(states, search.context.limits, search.context.names).trajectory
+        context = search.context
+        return time_path(states, context.limits, context.names, motion_limits=context.torques).trajectory
     except ApexError:
         return None
 
