@@ -23,13 +23,11 @@ from apex_ompl.perception.obstacles import ObstacleFinder
 from apex_ompl.perception.registration import RegistrationSettings, corrected
 from apex_ompl.perception.rendered_camera import RenderedCamera
 from apex_ompl.perception.rig import Eye, check_cameras, default_cameras, misplaced, noisy
-from apex_ompl.perception.surfaces import RobotSurface, body_surface
+from apex_ompl.perception.surfaces import RobotSurface, body_box
 from apex_ompl.perception.tracking import ObstacleTracker, TrackedObstacle, TrackerSettings
 from apex_ompl.perception.twin_camera import TwinCamera
 from apex_ompl.robot import Robot, load_robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle
-from apex_ompl.types import Array
-from apex_ompl.util.arrays import bounding_box
 from apex_ompl.util.display import fields_line
 from apex_ompl.util.validation import check_number, check_positive, check_seed
 
@@ -79,7 +77,7 @@ class CameraSensor:
         self._finder, self.tracker = ObstacleFinder(obstacles), ObstacleTracker(tracker)
         self.tracked: tuple[TrackedObstacle, ...] = ()
         self._surface, self._registration = RobotSurface(robot), registration or RegistrationSettings()
-        self._boxes = [_box_of(one) for one in self.attached]
+        self._boxes = [body_box(one, SPREAD) for one in self.attached]
         self._next = -np.inf
 
     __repr__ = fields_line
@@ -104,7 +102,7 @@ class CameraSensor:
             stamp = max(stamp, frame.stamp)
             given = corrected(frame, self._surface, self._registration)
             held = [self.robot.link_pose(given.registration.state, one.link) @ one.pose for one in self.attached]
-            found = [one for one in self._finder.find(given, frame.color) if not self._is_held(one.pose[:3, 3], held)]
+            found = self._finder.find(given, frame.color, list(zip(held, self._boxes, strict=True)))
             self.tracked = self.tracker.update(stamp, found, given)
             gone += self.tracker.gone
             seen |= {one.name for one in self.tracked if one.observed is not None}
@@ -118,28 +116,10 @@ class CameraSensor:
         solids, received = tuple(one.solid for one in there), stamp + self.latency
         return Observation(stamp, received, solids, errors, tuple(dict.fromkeys(gone)), bounds=True)
 
-    def _is_held(self, center: Array, held: Sequence[Array]) -> bool:
-        """Whether a center is in a held object, which may have the color of obstacles, too.
-
-        Args:
-            center: Shape (3,) [m].
-            held: Poses of the held objects, shape (4, 4) [m].
-        """
-        places = [pose[:3, :3].T @ (center - pose[:3, 3]) for pose in held]
-        return any(
-            ((low <= place) & (place <= high)).all() for place, (low, high) in zip(places, self._boxes, strict=True)
-        )
-
     def close(self) -> None:
         """Release what draws the images."""
         for eye in self.eyes:
             getattr(eye, "close", tuple)()
-
-
-def _box_of(one: AttachedObject) -> Array:
-    """Return the box around a held object in its frame, shape (2, 3) [m]."""
-    found: Array = bounding_box(body_surface(one).vertices) + np.array([[-SPREAD], [SPREAD]])
-    return found
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from apex_ompl.perception.looking import LookSettings, LookState, World, look_st
 from apex_ompl.perception.obstacle_settings import ObstacleSettings
 from apex_ompl.perception.obstacles import ObstacleFinder, SeenObstacle
 from apex_ompl.perception.registration import CorrectedFrame, corrected
-from apex_ompl.perception.surfaces import RobotSurface, body_surface, inverse
+from apex_ompl.perception.surfaces import RobotSurface, body_box, inverse
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject, Obstacle, pose_fields
 from apex_ompl.scene.constraints import Constraint
@@ -272,9 +272,9 @@ def _obstacles(looks: Sequence[_Look], settings: AlignSettings) -> tuple[tuple[S
         return (), [f"{looks[-1].frame.camera.name!r} gave no colors, without which no obstacle is found"]
     finder, found, reasons = ObstacleFinder(settings.obstacles), list[SeenObstacle](), []
     for look in colored:
-        balls = [(one.pose[:3, 3], _radius(one)) for one in look.held]
+        boxes = [(one.pose, _box(one)) for one in look.held]
         assert look.frame.color is not None
-        for new in finder.find(look.seen, look.frame.color, balls):
+        for new in finder.find(look.seen, look.frame.color, boxes):
             known = next((k for k, one in enumerate(found) if _same(one, new)), None)
             if known is None:
                 found.append(new)
@@ -294,9 +294,9 @@ def _same(first: SeenObstacle, second: SeenObstacle) -> bool:
     return apart < 0.5 * min(float(np.max(first.size)), float(np.max(second.size)))
 
 
-def _radius(one: HeldObject) -> float:
-    """Return the radius of a ball around an object's origin that holds it, with two standard deviations [m]."""
-    return body_surface(one.body).radius + 2.0 * float(np.sqrt(np.trace(one.covariance[3:, 3:])))
+def _box(one: HeldObject) -> Array:
+    """Return the box around an object in its frame, with two standard deviations of its place [m]."""
+    return body_box(one.body, 2.0 * float(np.sqrt(np.trace(one.covariance[3:, 3:]))))
 
 
 def _vector(one: HeldObject) -> WorldVector:

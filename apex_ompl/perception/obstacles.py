@@ -114,7 +114,7 @@ class ObstacleFinder:
         self._color = Color(s.hue, s.hue_width, s.saturation, s.value)
 
     def find(
-        self, seen: CorrectedFrame, color: NDArray[np.uint8], others: Sequence[tuple[Array, float]] = (),
+        self, seen: CorrectedFrame, color: NDArray[np.uint8], others: Sequence[tuple[Array, Array]] = (),
         known: Sequence[KnownSize] = (),
     ) -> tuple[SeenObstacle, ...]:  # fmt: skip
         """Return the obstacles of a frame, the one with the most pixels first.
@@ -122,8 +122,8 @@ class ObstacleFinder:
         Args:
             seen: Corrected depths.
             color: Color image of the frame, shape (height, width, 3).
-            others: Centers [m] and radii [m] of balls in the world whose contents are no obstacles, such as objects in
-                hands.
+            others: Poses in the world, shape (4, 4), and boxes in their frames, shape (2, 3) [m], such as those of
+                objects in hands: what has its center in one is no obstacle.
             known: Sizes that obstacles may have, by the user or by earlier observations. What fits none of them has a
                 size of its own.
         """
@@ -133,14 +133,14 @@ class ObstacleFinder:
         while parts:
             part = parts.pop()
             patch = patch_of(part, seen, s)
-            if patch is None or not self._wanted(patch, seen, others):
+            if patch is None or not self._wanted(patch, seen):
                 continue
             estimate = fitted(patch, seen, s, known)
             if part.pieces and (estimate is None or estimate.misfit > s.most_misfit):
                 parts += part.pieces  # they are no single obstacle
                 continue
             answer = None if estimate is None else _answer(estimate, patch, seen)
-            if answer is not None and self._sized(answer):
+            if answer is not None and self._sized(answer) and not _is_in(answer.pose[:3, 3], others):
                 found.append(answer)
         return tuple(sorted(found, key=lambda one: -one.points))
 
@@ -154,17 +154,21 @@ class ObstacleFinder:
         """Return the pixels of an image, shape (height, width, 3), that have the color."""
         return self._color.pixels(image)
 
-    def _wanted(self, patch: Patch, seen: CorrectedFrame, others: Sequence[tuple[Array, float]]) -> bool:
+    def _wanted(self, patch: Patch, seen: CorrectedFrame) -> bool:
         pose, s = seen.registration.pose, self.settings
         center = pose[:3, :3] @ patch.coarse.points[: patch.coarse.measured].mean(axis=0) + pose[:3, 3]
-        if not ((center > s.low) & (center < s.high)).all():
-            return False
-        return all(np.linalg.norm(center - place) > radius for place, radius in others)
+        return bool(((center > s.low) & (center < s.high)).all())
 
     def _sized(self, found: SeenObstacle) -> bool:
         """Return whether the lengths of what was found are those of an obstacle."""
         s = self.settings
         return bool(found.size.min() > 0.5 * s.smallest and s.smallest < found.size.max() < s.largest)
+
+
+def _is_in(center: Array, boxes: Sequence[tuple[Array, Array]]) -> bool:
+    """Return whether a center in the world is in a box at a pose."""
+    places = [(pose[:3, :3].T @ (center - pose[:3, 3]), box) for pose, box in boxes]
+    return any(((low <= place) & (place <= high)).all() for place, (low, high) in places)
 
 
 def _answer(estimate: Estimate, patch: Patch, seen: CorrectedFrame) -> SeenObstacle:

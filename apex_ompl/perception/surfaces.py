@@ -17,6 +17,7 @@ from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import capped, triangles
 from apex_ompl.types import Array, Indices
+from apex_ompl.util.arrays import bounding_box
 
 SLICES = 32  # of round surfaces
 BALL_STEPS = 3  # subdivisions of an icosahedron
@@ -79,6 +80,16 @@ def body_surface(body: Body, slices: int = SLICES, ball_steps: int = BALL_STEPS)
         ApexError: Its file cannot be read, or it has no surface of triangles.
     """
     return geometry_surface(coal_geometry(body), body.name, slices, ball_steps)
+
+
+def body_box(body: Body, spread: float) -> Array:
+    """Return the box around a body in its frame, larger by a distance [m] on all sides, shape (2, 3) [m].
+
+    Raises:
+        ApexError: Its file cannot be read, or it has no surface of triangles.
+    """
+    found: Array = bounding_box(body_surface(body).vertices) + np.array([[-spread], [spread]])
+    return found
 
 
 def geometry_surface(

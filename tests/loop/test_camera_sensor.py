@@ -131,7 +131,7 @@ def test_names_of_cameras_are_their_own(kernel: Any = None) -> None:
     assert not unexpected(tracker, [CUBE], 0.0, named=False)
 
 
-def test_a_cube_beside_a_held_object_is_seen_and_a_center_in_the_object_is_no_obstacle() -> None:
+def test_a_cube_beside_a_held_object_is_seen() -> None:
     still = problems.load(PROBLEM).still
     one, q = still.attached[0], still.start_state(robot().joint_names)
     pose = robot().link_pose(q, one.link) @ one.pose
@@ -143,10 +143,7 @@ def test_a_cube_beside_a_held_object_is_seen_and_a_center_in_the_object_is_no_ob
         seen = sensor.read(0.0)
         assert seen is not None
         found += any(np.linalg.norm(np.subtract(o.position, place)) < 0.03 for o in seen.seen)
-        held = [robot().link_pose(q, o.link) @ o.pose for o in still.attached]
-        assert not sensor._is_held(place, held)
     assert found >= 3
-    assert sensor._is_held(pose[:3, 3], held)
 
 
 def test_faulty_cameras_are_refused() -> None:

@@ -37,7 +37,7 @@ def placed(x: float, y: float, z: float, turn: tuple[float, float, float] = (0.0
 
 def found_in(
     parts: list[Part], settings: ObstacleSettings | None = None, *, gain: float = 0.5, seed: int = 0,
-    known: Sequence[KnownSize] = (),
+    known: Sequence[KnownSize] = (), others: Sequence[tuple[np.ndarray, np.ndarray]] = (),
 ) -> tuple[SeenObstacle, ...]:  # fmt: skip
     rng = np.random.default_rng(seed)
     floor = solid_part(coal.Box(4.0, 4.0, 0.02), placed(0.0, 0.0, 0.0), 9, GRAY)
@@ -46,7 +46,7 @@ def found_in(
     depth = DepthSensor(gain=gain).measure(view, CAMERA, rng)[0]
     registered = Registration(EYE, 1.0, np.zeros(0), np.diag([1e-4] * 3 + [3e-4] * 3 + [1e-4]) ** 2, 0, 0)
     seen = CorrectedFrame(CAMERA, depth, registered, gain * CAMERA.depth.noise)
-    return ObstacleFinder(settings).find(seen, colors(view, everything, LIGHT, rng), known=known)
+    return ObstacleFinder(settings).find(seen, colors(view, everything, LIGHT, rng), others, known)
 
 
 CASES = {
@@ -90,6 +90,15 @@ def test_other_colors_are_no_obstacles_and_other_red_things_are_others() -> None
     assert np.linalg.norm(found[1].pose[:3, 3] - (0.1, 0.35, 0.1)) < 0.015
     (green,) = found_in(parts, ObstacleSettings(hue=120.0, hue_width=25.0))
     assert np.linalg.norm(green.pose[:3, 3] - (0.1, -0.35, 0.2)) < 0.015
+
+
+def test_what_has_its_center_in_another_body_is_no_obstacle_and_what_is_beside_it_is_one() -> None:
+    solid, pose, size = CASES["cube"]
+    half = 0.5 * np.asarray(size)
+    for shift, count in ((0.0, 0), (2.0, 1)):
+        held = pose.copy()
+        held[:3, 3] += shift * half[0] * pose[:3, 0]
+        assert len(found_in([solid_part(solid, pose, 5, RED)], others=[(held, np.stack([-half, half]))])) == count
 
 
 def test_a_bar_before_an_obstacle_does_not_divide_it() -> None:
