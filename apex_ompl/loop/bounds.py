@@ -36,6 +36,14 @@ def protrusion(inner: Obstacle, bound: Obstacle) -> float:
     return max(_distance(DOT, pin.SE3(np.eye(3), corner), shape, there) for corner in _corners(inner))
 
 
+def change(first: Obstacle, second: Obstacle) -> float:
+    """Return the largest difference of the half extents of two obstacles along the axes of the world [m].
+
+    Where both contain the same obstacle, their centers show its way up to this, as one of its ends is seen.
+    """
+    return float(np.abs(np.ptp(_corners(first), axis=0) - np.ptp(_corners(second), axis=0)).max()) / 2.0
+
+
 def _convex(obstacle: Obstacle) -> tuple[coal.CollisionGeometry, pin.SE3]:
     shape, pose = world_geometry(obstacle)
     return convex_hull(shape) if isinstance(shape, coal.BVHModelBase) else shape, pin.SE3(pose)

@@ -114,7 +114,10 @@ class CameraSensor:
                 gone.append(one.name)
         errors = {one.name: self.error for one in there}
         solids, received = tuple(one.solid for one in there), stamp + self.latency
-        return Observation(stamp, received, solids, errors, tuple(dict.fromkeys(gone)), bounds=True)
+        velocities = {one.name: (one.velocity, one.speed_deviation) for one in there}
+        return Observation(
+            stamp, received, solids, errors, tuple(dict.fromkeys(gone)), bounds=True, velocities=velocities
+        )  # fmt: skip
 
     def close(self) -> None:
         """Release what draws the images."""

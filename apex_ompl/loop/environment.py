@@ -62,6 +62,9 @@ class Observation:
         gone: Names of obstacles that are not there any more.
         bounds: Whether shapes are bounds: bodies that contain the obstacles, up to the errors, and change as more of
             an obstacle is seen. Only bounds that are apart contradict each other, wherever their centers are.
+        velocities: What a sensor that tracks obstacles itself knows of their velocities, by names: a velocity, shape
+            (3,), and its standard deviation on each axis [m/s]. It counts where it is known better than by the places
+            seen, such as while the bounds of an obstacle still change.
     """
 
     stamp: float
@@ -70,6 +73,7 @@ class Observation:
     errors: Mapping[str, ArrayLike] = field(default_factory=dict)
     gone: tuple[str, ...] = ()
     bounds: bool = False
+    velocities: Mapping[str, tuple[ArrayLike, float]] = field(default_factory=dict)
 
     __repr__ = fields_line
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from apex_ompl.kernel import Kernel
-from apex_ompl.loop.bounds import gap, protrusion
+from apex_ompl.loop.bounds import change, gap, protrusion
 from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.sensor import CUT
 from apex_ompl.moving.dynamic_obstacles import DynamicObstacles, allowed_rows, clearance_in_time
@@ -99,20 +99,23 @@ class Track:
             settings: Parameters of the filter.
             error: Largest error of the position, NaN for that of the settings [m].
         """
-        dt, noise = stamp - self.stamp, _noise(settings, error) ** 2 + 1e-12
+        same = same_solid(seen, self.shape)
+        other = self.bounds and not same  # bound, whose center may have moved within the obstacle
+        noise = _noise(settings, error) ** 2 + (change(seen, self.shape) ** 2 if other else 0.0) + 1e-12
+        dt = stamp - self.stamp
         forward = np.array([[1.0, dt], [0.0, 1.0]])
         drift = settings.power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
         expected = forward @ self.covariance @ forward.T + drift
         miss = np.array(seen.position, float) - (self.place + dt * self.velocity)
         spread = expected[0, 0] + noise
-        same = same_solid(seen, self.shape)
         before = self.looks[1 - LOOKS :] if same else []  # a position of another shape does not bound this one
         self.shape, self.stamp, self.unseen, self.looks = seen, stamp, 0.0, [*before, (stamp, *seen.position, error)]
-        if self.bounds and not same:  # the center of another bound tells nothing of the velocity
+        turned = miss @ miss > GATE * spread
+        if turned and other:  # which tells nothing of the velocity
             self.place, self.seen = np.array(seen.position, float), self.seen + 1
             self.covariance = np.diag([noise, expected[1, 1]])
             return True
-        if miss @ miss > GATE * spread:
+        if turned:
             fresh = Track.new(seen, stamp, settings, error)
             self.place, self.velocity, self.covariance, self.seen = fresh.place, fresh.velocity, fresh.covariance, 1
             return False
@@ -122,6 +125,17 @@ class Track:
         self.covariance = expected - np.outer(gain, expected[0])
         self.seen += 1
         return True
+
+    def take_velocity(self, velocity: ArrayLike, deviation: float) -> None:
+        """Take a velocity that a sensor tells, where it is better known than by the filter.
+
+        Args:
+            velocity: The velocity, shape (3,) [m/s].
+            deviation: Its standard deviation on each axis [m/s].
+        """
+        if deviation**2 < self.covariance[1, 1]:
+            self.velocity = np.array(velocity, float)
+            self.covariance = np.diag([self.covariance[0, 0], deviation**2])
 
     def growth(self, settings: TrackSettings) -> tuple[float, float]:
         """Return the margin of the obstacle at the stamp [m], and its growth after that [m/s]."""
@@ -150,6 +164,20 @@ def error_fault(error: Any) -> str:
     if np.abs(given - given.T).max() > rounding or np.linalg.eigvalsh(given)[0] < -rounding:
         return "is not symmetric and positive semidefinite"
     return ""
+
+
+def velocity_fault(told: Any) -> str:
+    """Return why a velocity of an observation is none (:class:`apex_ompl.loop.environment.Observation`), or nothing."""
+    try:
+        velocity, deviation = told
+        given, spread = np.asarray(velocity, float), float(deviation)
+    except (TypeError, ValueError):
+        return "is no velocity and its standard deviation"
+    if given.shape != (AXES,):
+        return f"has the shape {given.shape}"
+    if not (np.isfinite(given).all() and math.isfinite(spread)):
+        return "is not finite"
+    return "has a negative standard deviation" if spread < 0.0 else ""
 
 
 def largest_error(error: ArrayLike) -> float:
@@ -229,6 +257,8 @@ class Tracker:
             elif stamp > track.stamp and not self._take_place(track, seen, stamp, error):
                 way = float(np.linalg.norm(np.subtract(seen.position, track.shape.position)))
                 found.append(f"{seen.name} was {way:.3g} m away {stamp - track.stamp:.3g} s before")
+            if seen.name in observation.velocities and self.tracks[seen.name].stamp == stamp:
+                self.tracks[seen.name].take_velocity(*observation.velocities[seen.name])
         self._remove(observation.gone, stamp)
         self._forget({seen.name for seen in observation.seen}, watched)
         return Taken(doubted=tuple(found))
@@ -249,6 +279,10 @@ class Tracker:
             fault = error_fault(error) if name in (*names, *observation.gone) else "has no obstacle"
             if fault:
                 return f"the error of {name} {fault}"
+        for name, told in observation.velocities.items():
+            fault = velocity_fault(told) if name in names else "has no obstacle"
+            if fault:
+                return f"the velocity of {name} {fault}"
         if len({*names}) < len(names):
             return "it has a name twice"
         if len({*names, *self.tracks}) > MOST_TRACKS:

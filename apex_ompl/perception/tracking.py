@@ -46,6 +46,9 @@ LARGEST_MISFIT = 9.0  # of lengths, squared and normalized, that counts in the a
 SHORTEST = 0.01  # of a length [m]
 BEHIND = 0.03  # by which a depth is behind an obstacle that is not there [m]
 PIECE = 2.0  # standard deviations within which a piece of an obstacle is inside it
+KNOWN = 0.25  # standard deviation of a place that is known, of the mean length
+RECENT = 0.15  # time since an obstacle was seen within which it is still about there [s]
+CONFIRMED = 12  # frames in which an obstacle was seen after which it is no piece of another one
 GRID = (-0.6, 0.0, 0.6)  # places in a solid that are looked through, of its half lengths
 
 
@@ -132,6 +135,11 @@ class TrackedObstacle:
     def place_covariance(self) -> Array:
         """Covariance of the center in the axes of the world, shape (3, 3) [m^2]."""
         return self.covariance[PLACE, PLACE]
+
+    @property
+    def speed_deviation(self) -> float:
+        """Standard deviation of the velocity along its least certain axis [m/s]."""
+        return math.sqrt(max(float(np.linalg.eigvalsh(self.covariance[SPEED, SPEED])[-1]), 0.0))
 
     def known_size(self) -> KnownSize:
         """Return its size for :meth:`apex_ompl.perception.ObstacleFinder.find` in later frames."""
@@ -245,22 +253,24 @@ class ObstacleTracker:
             self._predict(track, stamp)
         passed = max(0.0, stamp - self._last) if math.isfinite(self._last) else 0.0
         self._last = stamp
-        pairs = self._pairs(seen)
         camera = "" if frame is None else frame.camera.name
         eye = None if frame is None else frame.registration.pose[:3, 3]
         for track in self._tracks:
             track.observed = None
-        for i, j in pairs:
-            self._take(self._tracks[i], seen[j], camera, eye)
-        taken, used = {i for i, _ in pairs}, {j for _, j in pairs}
-        for i, track in enumerate(self._tracks):
-            if i not in taken and (frame is None or _open(track, frame, robot)):
+        left = list(seen)
+        for _ in range(2):  # what an obstacle no longer holds, now that its place is known, may be another one
+            rest = [track for track in self._tracks if track.observed is None]
+            for track, one in self._pairs(rest, left):
+                self._take(track, one, camera, eye)
+                left = [other for other in left if other is not one]
+            left = [one for one in left if not any(self._sure(track) and _holds(track, one) for track in self._tracks)]
+        for track in self._tracks:
+            if track.observed is None and (frame is None or _open(track, frame, robot)):
                 track.hits.append(False)
                 track.unseen += passed
-        known = [self._tracks[i] for i in taken]
-        others = [one for j, one in enumerate(seen) if j not in used and not any(_holds(t, one) for t in known)]
-        self._tracks += [self._new(stamp, one, camera, eye) for one in others]
-        self._name_and_forget()
+        taken = [track for track in self._tracks if track.observed is not None and self._sure(track)]
+        self._tracks += [self._new(stamp, one, camera, eye) for one in left]
+        self._name_and_forget(taken)
         return tuple(self._answer(track) for track in self._tracks if track.name)
 
     def _check(
@@ -294,17 +304,25 @@ class ObstacleTracker:
         track.place = track.place + dt * track.velocity
         track.stamp = stamp
 
-    def _pairs(self, seen: Sequence[SeenObstacle]) -> list[tuple[int, int]]:
+    def _pairs(self, tracks: Sequence[_Track], seen: Sequence[SeenObstacle]) -> list[tuple[_Track, SeenObstacle]]:
         """Return tracks and observations of the same obstacles, of the least sum of distances."""
-        if not self._tracks or not seen:
+        if not tracks or not seen:
             return []
-        cost = np.full((len(self._tracks), len(seen)), np.inf)
-        for i, track in enumerate(self._tracks):
-            for j, one in enumerate(seen):
-                cost[i, j] = self._cost(track, one)
+        cost = np.full((len(tracks), len(seen)), np.inf)
+        sure = [track for track in self._tracks if self._sure(track)]
+        for j, one in enumerate(seen):
+            holding = [track for track in sure if _holds(track, one)]
+            for i, track in enumerate(tracks):
+                if not holding or track in holding:  # what is inside an obstacle is no other one
+                    cost[i, j] = self._cost(track, one)
         far = 1e6
         rows, columns = self._assign(np.where(np.isfinite(cost), cost, far))
-        return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if np.isfinite(cost[i, j])]
+        return [(tracks[i], seen[j]) for i, j in zip(rows, columns, strict=True) if np.isfinite(cost[i, j])]
+
+    def _sure(self, track: _Track) -> bool:
+        """Return whether an obstacle is about where its track is: it was seen lately, and its place is known."""
+        deviation = math.sqrt(np.diag(track.covariance)[PLACE].max())
+        return bool(track.name) and self._last - track.last <= RECENT and deviation <= KNOWN * track.size.mean()
 
     def _cost(self, track: _Track, one: SeenObstacle) -> float:
         """Return the distance of an observation from a track, infinite where it cannot be the same obstacle."""
@@ -411,15 +429,17 @@ class ObstacleTracker:
                 track.covariance[rows, rows] += (1.0 - kept * kept) * np.eye(SEEN)
         track.views[camera] = now
 
-    def _name_and_forget(self) -> None:
-        """Name obstacles that were seen often enough, and forget those that are gone."""
+    def _name_and_forget(self, sure: Sequence[_Track]) -> None:
+        """Name obstacles that were seen often enough, and forget those that are gone, or pieces of those seen now."""
         s, kept, gone = self.settings, [], []
         for track in self._tracks:
             if not track.name and sum(track.hits) >= s.births:
                 self._names += 1
                 track.name = f"seen_{self._names}"
             lost = not track.name and len(track.hits) - sum(track.hits) > s.of - s.births
-            if lost or track.unseen > s.memory or track.stamp - track.last > s.longest:
+            new = track.observed is None and track.frames < CONFIRMED
+            piece = new and any(other.frames > track.frames and _holds(other, track) for other in sure)
+            if lost or piece or track.unseen > s.memory or track.stamp - track.last > s.longest:
                 gone += [track.name] if track.name else []
             else:
                 kept.append(track)
@@ -448,9 +468,10 @@ def _view(track: _Track, eye: Array | None) -> Array | None:
     return None if eye is None else track.rotation.T @ (eye - track.place)
 
 
-def _holds(track: _Track, one: SeenObstacle) -> bool:
-    """Return whether half of what was seen is inside an obstacle that was seen, too: a piece of it behind an arm."""
-    points = np.array(list(product(GRID, repeat=3))) * one.size / 2.0 @ one.pose[:3, :3].T + one.pose[:3, 3]
+def _holds(track: _Track, one: SeenObstacle | _Track) -> bool:
+    """Return whether half of what was seen is inside an obstacle that is known: a piece of it behind something."""
+    pose = one.pose() if isinstance(one, _Track) else one.pose
+    points = np.array(list(product(GRID, repeat=3))) * one.size / 2.0 @ pose[:3, :3].T + pose[:3, 3]
     margin = PIECE * np.sqrt(np.diag(track.covariance)[SIZE] + np.diag(track.covariance)[PLACE].max())
     off = np.abs((points - track.place) @ track.rotation) <= track.size / 2.0 + margin
     return bool(off.all(axis=1).mean() >= 0.5)
