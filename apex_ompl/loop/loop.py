@@ -196,6 +196,7 @@ class Loop:
     def observe(
         self, stamp: float, objects: Iterable[Obstacle] = (), *, errors: Mapping[str, ArrayLike] | None = None,
         clouds: Mapping[str, ArrayLike] | None = None, radius: float = POINT_RADIUS, bounds: bool = False,
+        velocities: Mapping[str, tuple[ArrayLike, float]] | None = None,
     ) -> None:  # fmt: skip
         """Take an observation of obstacles that move, or may; may be called from any thread.
 
@@ -219,13 +220,15 @@ class Loop:
             radius: Radius of the balls around the points of clouds [m].
             bounds: Whether shapes are bounds that contain the obstacles and change as more of them is seen
                 (:class:`apex_ompl.loop.Observation`).
+            velocities: Velocities, shape (3,), and their standard deviations on each axis [m/s] by name, as a sensor
+                knows them that tracks obstacles itself. They count where they are known better than by the places.
 
         Raises:
-            ParameterError: The stamp is no number, an object is no Obstacle, errors or clouds are not given by name, or
-                a cloud has another shape.
+            ParameterError: The stamp is no number, an object is no Obstacle, errors, clouds or velocities are not given
+                by name, or a cloud has another shape.
             FileFormatError: The radius is not positive, or the name of a cloud is none for an obstacle.
         """
-        for name, given in (("errors", errors), ("clouds", clouds)):
+        for name, given in (("errors", errors), ("clouds", clouds), ("velocities", velocities)):
             if not isinstance(given, Mapping | None):
                 raise ParameterError(name, given, "a mapping by names")
         seen = tuple(objects)
@@ -237,7 +240,9 @@ class Loop:
             found = {name: self._cloud(name, points, radius) for name, points in (clouds or {}).items()}
             bodies = tuple(body for body in found.values() if body is not None)
             gone = tuple(name for name, body in found.items() if body is None)
-            self._waiting.append(Observation(at, at, (*seen, *bodies), dict(errors or {}), gone, bounds))
+            self._waiting.append(
+                Observation(at, at, (*seen, *bodies), dict(errors or {}), gone, bounds, dict(velocities or {}))
+            )
 
     def _cloud(self, name: str, points: ArrayLike, radius: float) -> Obstacle | None:
         """Return the obstacle of a cloud, in the files that a planner process reads; None without points.

@@ -99,9 +99,9 @@ class Track:
             settings: Parameters of the filter.
             error: Largest error of the position, NaN for that of the settings [m].
         """
-        same = same_solid(seen, self.shape)
-        other = self.bounds and not same  # bound, whose center may have moved within the obstacle
-        noise = _noise(settings, error) ** 2 + (change(seen, self.shape) ** 2 if other else 0.0) + 1e-12
+        same, noise = same_solid(seen, self.shape), _noise(settings, error) ** 2 + 1e-12
+        moved = 0.0 if same or not self.bounds else change(seen, self.shape)  # its center within the obstacle, at most
+        other, noise = moved**2 > noise, noise + moved**2
         dt = stamp - self.stamp
         forward = np.array([[1.0, dt], [0.0, 1.0]])
         drift = settings.power * np.array([[dt**3 / 3.0, dt**2 / 2.0], [dt**2 / 2.0, dt]])
@@ -111,7 +111,7 @@ class Track:
         before = self.looks[1 - LOOKS :] if same else []  # a position of another shape does not bound this one
         self.shape, self.stamp, self.unseen, self.looks = seen, stamp, 0.0, [*before, (stamp, *seen.position, error)]
         turned = miss @ miss > GATE * spread
-        if turned and other:  # which tells nothing of the velocity
+        if other or (turned and moved > 0.0):  # the center of another bound tells nothing of the velocity
             self.place, self.seen = np.array(seen.position, float), self.seen + 1
             self.covariance = np.diag([noise, expected[1, 1]])
             return True
@@ -127,13 +127,14 @@ class Track:
         return True
 
     def take_velocity(self, velocity: ArrayLike, deviation: float) -> None:
-        """Take a velocity that a sensor tells, where it is better known than by the filter.
+        """Take a velocity that a sensor tells, where it is better known than by the filter and nothing turned just now.
 
         Args:
             velocity: The velocity, shape (3,) [m/s].
             deviation: Its standard deviation on each axis [m/s].
         """
-        if deviation**2 < self.covariance[1, 1]:
+        turned = self.seen == 1 and len(self.looks) > 1  # which the sensor's own filter may not know yet
+        if deviation**2 < self.covariance[1, 1] and not turned:
             self.velocity = np.array(velocity, float)
             self.covariance = np.diag([self.covariance[0, 0], deviation**2])
 

@@ -14,7 +14,7 @@ from loops import PROBLEM, ByHand, line
 
 from apex_ompl import Loop, problems
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.loop.bounds import gap, protrusion
+from apex_ompl.loop.bounds import change, gap, protrusion
 from apex_ompl.loop.cycle import unexpected
 from apex_ompl.loop.environment import Observation
 from apex_ompl.loop.tracking import Tracker, TrackSettings
@@ -104,7 +104,10 @@ def test_a_bound_that_shrinks_as_more_is_seen_contradicts_nothing(bounds: bool) 
     speed = np.abs(known.tracks["seen"].velocity).max()
     assert bool(known.take(wall(0.12, 20 / 30.0, bounds=bounds)).doubted) is not bounds
     if bounds:
-        assert np.abs(known.tracks["seen"].velocity).max() == pytest.approx(speed, abs=0.01) and known.tracks["seen"].seen == 21
+        assert (
+            np.abs(known.tracks["seen"].velocity).max() == pytest.approx(speed, abs=0.01)
+            and known.tracks["seen"].seen == 21
+        )
         cube = Obstacle(name="cube", box=(0.1, 0.1, 0.1), position=(0.56, 0.0, 0.5))
         assert not unexpected(known, [cube], 20 / 30.0, named=False)
         assert unexpected(known, [cube.model_copy(update={"position": (0.45, 0.0, 0.5)})], 20 / 30.0, named=False)
@@ -126,6 +129,30 @@ def test_a_bound_that_moves_has_a_velocity() -> None:
     for k in range(40):
         known.take(wall(0.1, k / 30.0, x=0.5 + 0.15 * k / 30.0))
     assert known.tracks["seen"].velocity == pytest.approx([0.15, 0.0, 0.0], abs=1e-3)
+
+
+def test_a_bound_that_moves_while_it_shrinks_has_a_velocity_that_its_deviation_holds() -> None:
+    rng, off = np.random.default_rng(3), []
+    for _ in range(40):
+        known, speed = tracker(), rng.uniform(-0.15, 0.15)
+        for k in range(8):
+            depth, x = 0.1 + 0.05 * 0.5**k, 0.5 + speed * k / 30.0 + rng.normal(0.0, 0.001)
+            known.take(wall(depth, k / 30.0, x=x))
+        track = known.tracks["seen"]
+        off.append((track.velocity[0] - speed) / np.sqrt(track.covariance[1, 1]))
+    assert np.abs(off).max() < 3.0 and np.sqrt(track.covariance[1, 1]) < 0.06  # of .2 when it was new
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 10**6))
+def test_centers_of_bounds_of_one_body_differ_by_no_more_than_their_change_where_an_end_is_shared(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first = rng.uniform(0.05, 0.5, 3)
+    second = first * rng.uniform(0.5, 1.0, 3)
+    side = rng.choice([-1.0, 1.0], 3)
+    boxes = [Obstacle(name="box", box=tuple(size), position=tuple(side * size / 2.0)) for size in (first, second)]
+    shift = np.abs(np.subtract(boxes[0].position, boxes[1].position)).max()
+    assert change(*boxes) == pytest.approx(shift) and change(boxes[0], boxes[0]) == 0.0
 
 
 def test_a_loop_takes_bounds() -> None:

@@ -55,6 +55,32 @@ def test_the_error_of_a_covariance_is_three_standard_deviations_of_its_longest_a
     assert widths.max() <= largest_error(covariance) + 1e-12
 
 
+def test_a_velocity_counts_where_it_is_known_better_than_by_places() -> None:
+    known, told = bounded(), (0.02, -0.04, 0.03)
+    known.take(replace(look(0.0, (1.0, 0.0, 0.5)), velocities={"ball": (told, 0.5)}))
+    assert not known.tracks["ball"].velocity.any()  # a new one has .2 m/s
+    known.take(replace(look(0.05, (1.0, 0.0, 0.5)), velocities={"ball": (told, 0.03)}))
+    track = known.tracks["ball"]
+    assert track.velocity == pytest.approx(told) and track.growth(known.settings)[1] == pytest.approx(0.03)
+    for k in range(2, 40):
+        known.take(replace(look(0.05 * k, (1.0, 0.0, 0.5), 0.001), velocities={"ball": (told, 0.03)}))
+    assert np.abs(known.tracks["ball"].velocity).max() < 0.02  # the places say that it stands
+
+
+@pytest.mark.parametrize(
+    ("velocity", "words"),
+    [
+        (0.1, "is no velocity"), (((0.1, 0.0), 0.1), "the shape"), (((NAN, 0.0, 0.0), 0.1), "not finite"),
+        (((0.1, 0.0, 0.0), -0.1), "negative"), (((0.1, 0.0, 0.0), "fast"), "is no velocity"),
+    ],
+)  # fmt: skip
+def test_a_velocity_that_is_none_refuses_an_observation(velocity: Any, words: str) -> None:
+    known = bounded()
+    refused = known.take(replace(look(0.0, (1.0, 0.0, 0.5)), velocities={"ball": velocity})).refused
+    assert refused.startswith("the velocity of ball") and words in refused and not known.tracks
+    assert "has no obstacle" in known.take(Observation(0.0, 0.0, (), velocities={"ball": ((0, 0, 0), 0.1)})).refused
+
+
 @pytest.mark.parametrize(
     ("error", "words"),
     [(NAN, "not finite"), (-0.01, "negative"), (np.full((3, 3), NAN), "not finite"),

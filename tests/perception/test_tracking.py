@@ -275,6 +275,31 @@ def test_a_piece_of_an_obstacle_is_no_other_one() -> None:
     assert len(tracker.update(11 / RATE, [seen(here, rng, size=size), beside])) == 2
 
 
+def test_a_piece_that_one_camera_sees_is_of_what_the_other_one_saw_just_before() -> None:
+    """A cube behind another one: each camera sees another side of it, one of them only a sliver."""
+    rng, tracker = np.random.default_rng(14), ObstacleTracker(TrackerSettings(births=1, of=1))
+    front, above = (frame_of(np.zeros((120, 160)), name=name) for name in ("front", "above"))
+    here, size = np.array([0.2, 0.0, 0.3]), np.array([0.2, 0.2, 0.2])
+    sliver, tight = np.array([0.02, 0.18, 0.18]), np.diag([0.02] * 3 + [0.002] * 3 + [0.004] * 3) ** 2
+    for k in range(20):
+        tracker.update(k / RATE, [seen(here, rng, size=size, covariance=tight)], above)
+        piece = seen(here + TURN @ (0.08, 0.0, 0.0), rng, size=sliver, covariance=tight)
+        (found,) = tracker.update(k / RATE, [piece], front)
+    assert np.linalg.norm(found.pose[:3, 3] - here) < 0.1 and found.frames > 20
+
+
+def test_an_obstacle_that_was_a_piece_is_gone_when_the_whole_is_seen() -> None:
+    rng, tracker = np.random.default_rng(15), ObstacleTracker(still(births=1, of=1, gate=9.0))
+    here, size = np.array([0.2, 0.0, 0.3]), np.array([0.2, 0.2, 0.2])
+    ends = [here + TURN @ (side * 0.08, 0.0, 0.0) for side in (-1.0, 1.0)]
+    slivers = [seen(end, rng, size=np.array([0.03, 0.18, 0.18]), error=np.zeros(9)) for end in ends]
+    assert len(tracker.update(0.0, slivers)) == 2  # both sides of a thing that hides its middle
+    for k in range(1, 40):
+        found = tracker.update(k / RATE, [seen(here, rng, size=size)], frame_of(np.full((120, 160), 0.3)))
+    (one,) = found
+    assert one.size == pytest.approx(size, abs=0.02) and np.linalg.norm(one.pose[:3, 3] - here) < 0.02
+
+
 def test_bad_input_is_refused() -> None:
     rng, tracker = np.random.default_rng(0), ObstacleTracker()
     tracker.update(1.0, [])
