@@ -19,6 +19,7 @@ START_TOLERANCE = 1e-3
 """Largest distance of the start of a motion from the commanded position [rad; synergies 0..1]."""
 RATE_SHARE = 1e-3  # the same of velocity and acceleration, as a share of their limits
 CLOCK_ROUNDING = 1e-9  # by which a time may be over [s]
+SETTLING = 0.1  # after its motion, for which a robot may be as far off as during it [s]
 
 
 class Commands:
@@ -145,8 +146,8 @@ class Commands:
         return found
 
     def forget(self, now: float) -> None:
-        """Drop motions that were replaced before a time [s], which ``states`` is not asked for again."""
-        k = max(bisect_right(self._starts, now) - 1, 0)
+        """Drop motions that ``states`` is not asked for again: replaced before a time [s], and not just before it."""
+        k = max(bisect_right(self._starts, now - SETTLING) - 1, 0)
         del self._starts[:k], self._motions[:k]
 
     def _still(self, position: Array) -> Trajectory:
@@ -190,10 +191,11 @@ class Commands:
     def _check_measured(self, motion: Trajectory, at: float, measured: DriverState, bounds: Bounds) -> None:
         """Check that a motion starts where the robot is: off by what it is off now, which it carries along.
 
-        A robot that moves may be off as far as it may while it follows a motion.
+        A robot that moves, or did just now, may be off as far as it may while it follows a motion.
         """
-        commanded, speeds = self.states(np.array([measured.stamp, max(at, measured.stamp)]))[:2]
-        off = np.abs(motion.positions[0] - commanded[1] - (measured.positions - commanded[0]))
+        stamp = measured.stamp
+        commanded, speeds = self.states(np.array([stamp - SETTLING, stamp, max(at, stamp)]))[:2]
+        off = np.abs(motion.positions[0] - commanded[2] - (measured.positions - commanded[1]))
         moves = (np.abs(speeds) > AT_REST).any()
         most = np.maximum(bounds.start, bounds.tracking) if moves else bounds.start
         if not (off <= most).all():

@@ -76,6 +76,26 @@ def test_a_robot_that_moves_may_be_off_at_a_handover_as_far_as_when_it_follows(
             assert not tried.driver.fault and tried.driver.end > 0.3
 
 
+def test_a_robot_that_settles_after_its_motion_may_be_off_as_far_as_during_it(
+    pushed: Callable[[Guard], Pushed],
+) -> None:
+    for later, refused in ((0.05, False), (0.2, True)):
+        tried = pushed(Guard(start=0.003))
+        first = tried.motion((0, 0.2))
+        tried.driver.send(first, 0.0)
+        tried.push(JOINT, 0.008, 28.0)
+        at = first.duration + later
+        tried.driver.advance(at)
+        assert float(np.abs(tried.driver.state().positions - first(first.duration))[JOINT]) > 0.004
+        second = tried.motion((1, 0.2), q=first(first.duration))
+        if refused:
+            with pytest.raises(DriverError, match=r"off the start of the motion .* at most 0\.003"):
+                tried.driver.send(second, at)
+        else:
+            tried.driver.send(second, at)
+            assert tried.driver.end > at + 0.1
+
+
 def test_a_start_off_the_measured_position_is_refused(pushed: Callable[[Guard], Pushed]) -> None:
     tried = pushed(Guard(start=0.003))
     tried.push(JOINT, 0.008, 28.0)
