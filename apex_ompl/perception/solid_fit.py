@@ -129,16 +129,19 @@ def fitted(
     best = _searched(patch, settings.most_misfit)
     if best is None:
         return None
-    factor, misfit = settings.inflation / settings.tempering, _misfit(best, patch)
+    factor = settings.inflation / settings.tempering
     sized = _of_known_size(best, patch, known)
     if sized is not None:
         return _honest(_estimate(sized, factor, seen), _misfit(sized, patch), settings)
     parts = _hypotheses(best, factor, patch, seen, settings)
     if best.start.kind == "box" and settings.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
+        if cube.fit.cost < best.fit.cost:  # cubes are boxes: the search ended in another minimum
+            best = min(best, _run(cube.solid, patch.fine, FINE_STEPS), key=_cost)
+            parts, cube = _hypotheses(best, factor, patch, seen, settings), _cube(best, patch)
         parts = [(one + float(np.log(1.0 - settings.cubes)), solid) for one, solid in parts]
         parts.append((cube.evidence + float(np.log(settings.cubes)), _estimate(cube, factor, seen)))
-    return _honest(mixture(parts), misfit, settings)
+    return _honest(mixture(parts), _misfit(best, patch), settings)
 
 
 def _misfit(found: _Found, patch: Patch) -> float:
