@@ -156,9 +156,11 @@ def _connected(
     for k in np.flatnonzero(chosen):
         part = mine & (owners == k)
         if (part & blind & (away > EDGE)).any():
-            part &= ~(blind & (away > EDGE) & _shadowed(kept & (labels != k), depth, filled + APART))
+            rivals, behind = kept & (labels != k), filled + APART
             empty = cv.distanceTransform((~(part & kept | steep)).astype(np.uint8), cv.DIST_L2, 5) > EDGE
-            part &= ~(blind & empty & _shadowed(~blind & (labels != k), depth, filled + APART))
+            shadow = (away > EDGE) & _shadowed(rivals, depth, behind)
+            shadow |= empty & _shadowed(rivals | ~(blind | own), depth, behind)
+            part &= ~(blind & shadow)
         found.append(
             ColorPart(
                 *corner, part, beside & (owners == k), filled, float(depth[labels == k].mean()),
