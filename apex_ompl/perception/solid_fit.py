@@ -30,6 +30,7 @@ from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 2, 4, 2
 HOPELESS = 2.2  # cost over the least, after the first steps, from which a start is given up
+DOUBTED = 1.0  # misfit above which the other kind is tried, too
 RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
 GROWN = 1.06  # ratio of lengths of a last start to those of the best fit, which may be too short
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
@@ -126,7 +127,7 @@ def fitted(
         settings: How much measurements say.
         known: Sizes that it may have, or others.
     """
-    best = _searched(patch, settings.most_misfit)
+    best = _searched(patch)
     if best is None:
         return None
     factor = settings.inflation / settings.tempering
@@ -181,14 +182,14 @@ def _hypotheses(
     return [(odds[k], _spread(_estimate(held[k], factor, seen), axis, STEP**2 / 12.0, side)) for k in likely]
 
 
-def _searched(patch: Patch, most_misfit: float) -> _Found | None:
+def _searched(patch: Patch) -> _Found | None:
     """Return the best fit from all starts; those of the other kind are tried again where it explains too little."""
     found = [_run(one, patch.coarse, FIRST_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
     least = min((one.fit.cost for one in found), default=np.inf)
     if not np.isfinite(least):
         return None
     best = _refined([one for one in found if one.fit.cost < HOPELESS * least], patch)
-    if best is None or _misfit(best, patch) > most_misfit:
+    if best is None or _misfit(best, patch) > DOUBTED:
         other = _refined([one for one in found if best is None or one.start.kind != best.start.kind], patch)
         best = min((one for one in (best, other) if one is not None), key=_cost, default=None)
     return None if best is None else min(best, _run(_grown(best.solid, GROWN), patch.fine, FINE_STEPS), key=_cost)

@@ -265,8 +265,8 @@ def test_a_box_is_searched_again_where_a_cube_explains_it_better(monkeypatch: py
     solid, pose, size = CASES["cube"]
     searched = solid_fit._searched
 
-    def too_long(patch: Patch, most_misfit: float) -> Any:
-        best = searched(patch, most_misfit)
+    def too_long(patch: Patch) -> Any:
+        best = searched(patch)
         assert best is not None
         axis = solid_fit._front(best.solid)
         return solid_fit._held(resized(best.solid, axis, 1.1 * float(best.solid.size[axis])), axis, patch.fine)
