@@ -42,7 +42,7 @@ VAGUE = 0.04  # standard deviation of the logarithm of a length above which it h
 KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
 UNEXPLAINED = 0.4  # standard deviation of ends of what one solid does not explain, over its largest length
-SUDDEN = 0.3  # relative increase of the misfit over which that spread comes
+EXPLAINED, SUDDEN = 0.8, 0.5  # shares of the largest misfit: where that spread comes, and over which it grows
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
 LONGER = 1.3  # ratio of lengths that tells whether one is
 NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
@@ -155,9 +155,8 @@ def _honest(one: Estimate, misfit: float, settings: ObstacleSettings) -> Estimat
 
     Errors of both ends of an axis are independent: the center has half the variance of an end, the length twice that.
     """
-    unexplained = (
-        UNEXPLAINED * float(one.solid.size.max()) * min(1.0, max(0.0, misfit / settings.most_misfit - 1.0) / SUDDEN)
-    )
+    share = min(1.0, max(0.0, misfit / settings.most_misfit - EXPLAINED) / SUDDEN)
+    unexplained = UNEXPLAINED * float(one.solid.size.max()) * share
     variance = settings.systematic**2 + unexplained**2
     more = np.diag(np.concatenate([np.zeros(3), np.full(3, variance / 2.0), 2.0 * variance / one.solid.size**2]))
     return Estimate(one.solid, one.covariance + more, misfit)
