@@ -173,7 +173,7 @@ def _connected(
 def _shadowed(others: Mask, depth: Array, behind: Array) -> Mask:
     """Return the pixels that are near others whose depths are larger than some.
 
-    A part hides from one eye of a stereo camera what is behind it: pixels without a depth there are no part of it, be
+    A part hides farther surfaces from one eye of a stereo camera: pixels without a depth there are no part of it, be
     they of its color. Beside an occluder, the part itself is hidden.
     """
     if not others.any():
