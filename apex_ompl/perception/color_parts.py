@@ -23,6 +23,7 @@ JUST_BEFORE = 0.01  # the same of an occluder between two parts of one [m]
 PAD = 8  # around an obstacle's pixels [pixels]
 NEIGHBOR = 40  # pixels from a measured one within which pixels of the color belong to it
 FLYING = 3  # pixels from a measured one within which depths may be between both sides of an edge
+EDGE, SHADOW = 2.0, 16.0  # width of what has no depth at an edge, and beside it [pixels]
 SPECKS = 3  # width of the median filter of the color [pixels]
 
 
@@ -111,8 +112,9 @@ def color_parts(
         filled = np.zeros(((shape[0] + 1) // 2, (shape[1] + 1) // 2), np.uint8)
         cv.drawContours(filled, [contour], 0, 1, cv.FILLED, offset=(-(left // 2), -(top // 2)))
         near = cv.dilate(filled, np.ones((3, 3), np.uint8)).repeat(2, axis=0).repeat(2, axis=1) > 0
-        own = _without_specks(color.pixels(image[crop])) & near[: shape[0], : shape[1]]
-        parts += _connected(own, depth[crop], (left, top), noise=noise, least=least)
+        colored = color.pixels(image[crop])
+        own = _without_specks(colored) & near[: shape[0], : shape[1]]
+        parts += _connected(own, colored, depth[crop], (left, top), noise=noise, least=least)
     return _merged(parts, depth, largest)
 
 
@@ -123,8 +125,13 @@ def _without_specks(colored: Mask) -> Mask:
     return np.asarray(colored & (cv.dilate(most, np.ones((3, 3), np.uint8)) > 0))
 
 
-def _connected(own: Mask, depth: Array, corner: tuple[int, int], *, noise: float, least: float) -> list[ColorPart]:
-    """Return the parts of the color in a window from a corner on (left, top) whose depths are connected."""
+def _connected(
+    own: Mask, colored: Mask, depth: Array, corner: tuple[int, int], *, noise: float, least: float
+) -> list[ColorPart]:  # fmt: skip
+    """Return the parts of the color in a window from a corner on (left, top) whose depths are connected.
+
+    Pixels ``own`` belong to one of them; others of the ``colored`` ones only may.
+    """
     cv = opencv()
     jump = _steps(depth, np.maximum(APART, 9.0 * noise * depth * depth))
     core = cv.morphologyEx((own & (depth > 0.0) & ~jump).astype(np.uint8), cv.MORPH_OPEN, np.ones((3, 3), np.uint8))
@@ -141,15 +148,42 @@ def _connected(own: Mask, depth: Array, corner: tuple[int, int], *, noise: float
     owner[nearest[kept]], known[nearest[kept]] = labels[kept], depth[kept]
     filled = np.where(kept, depth, known[nearest])
     other = (depth > 0.0) & (np.abs(depth - filled) > APART)
-    near, owners = own & (away <= NEIGHBOR), owner[nearest]
-    mine, maybe = near & ~other, near & other & (away <= FLYING)
-    return [
-        ColorPart(
-            *corner, mine & (owners == k), maybe & (owners == k), filled, float(depth[labels == k].mean()),
-            int(stats[k, cv.CC_STAT_AREA]),
-        )
-        for k in np.flatnonzero(chosen)
-    ]  # fmt: skip
+    near, owners, blind = own & (away <= NEIGHBOR), owner[nearest], depth <= 0.0
+    mine = near & ~other
+    beside = near & other & ((away <= FLYING) | (depth > filled))  # depths of steep sides are few and far between
+    beside |= colored & blind & ~near  # of what an occluder divides
+    found, steep = [], own & ~blind & ~kept
+    for k in np.flatnonzero(chosen):
+        part = mine & (owners == k)
+        if (part & blind & (away > EDGE)).any():
+            rivals, behind = kept & (labels != k), filled + APART
+            empty = cv.distanceTransform((~(part & kept | steep)).astype(np.uint8), cv.DIST_L2, 5) > EDGE
+            shadow = (away > EDGE) & _shadowed(rivals, depth, behind)
+            shadow |= empty & _shadowed(rivals | ~(blind | own), depth, behind)
+            part &= ~(blind & shadow)
+        found.append(
+            ColorPart(
+                *corner, part, beside & (owners == k), filled, float(depth[labels == k].mean()),
+                int(stats[k, cv.CC_STAT_AREA]),
+            )
+        )  # fmt: skip
+    return found
+
+
+def _shadowed(others: Mask, depth: Array, behind: Array) -> Mask:
+    """Return the pixels that are near others whose depths are larger than some.
+
+    A part hides farther surfaces from one eye of a stereo camera: pixels without a depth there are no part of it, be
+    they of its color. Beside an occluder, the part itself is hidden.
+    """
+    if not others.any():
+        return others
+    away, nearest = opencv().distanceTransformWithLabels(
+        (~others).astype(np.uint8), opencv().DIST_L2, 5, labelType=opencv().DIST_LABEL_PIXEL
+    )
+    known = np.zeros(int(nearest.max()) + 1)
+    known[nearest[others]] = depth[others]
+    return np.asarray((away <= SHADOW) & (known[nearest] > behind))
 
 
 def _steps(depth: Array, limit: Array) -> Mask:

@@ -49,7 +49,7 @@ class ObstacleSettings:
     point_share: float = 1.4
     contour_share: float = 0.3
     tempering: float = 3.2
-    inflation: float = 1.4
+    inflation: float = 0.75
     systematic: float = 0.0003
     most_misfit: float = 1.35
     most_points: int = 300

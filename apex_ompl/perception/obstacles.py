@@ -156,6 +156,8 @@ class ObstacleFinder:
 
     def _wanted(self, patch: Patch, seen: CorrectedFrame) -> bool:
         pose, s = seen.registration.pose, self.settings
+        if not patch.coarse.measured:
+            return False
         center = pose[:3, :3] @ patch.coarse.points[: patch.coarse.measured].mean(axis=0) + pose[:3, 3]
         return bool(((center > s.low) & (center < s.high)).all())
 

@@ -30,6 +30,7 @@ from apex_ompl.util.validation import check_array, check_positive, finite_array
 
 FIRST_STEPS, COARSE_STEPS, PROFILE_STEPS = 2, 4, 2
 HOPELESS = 2.2  # cost over the least, after the first steps, from which a start is given up
+DOUBTED = 1.0  # misfit above which the other kind is tried, too
 RIVALS, RIVAL = 2, 1.3  # fits that are refined at most, and their largest cost over the least
 GROWN = 1.06  # ratio of lengths of a last start to those of the best fit, which may be too short
 FRONT = 0.6  # share of the side that is seen most above which its depth has a mixture
@@ -41,7 +42,7 @@ VAGUE = 0.04  # standard deviation of the logarithm of a length above which it h
 KNOWN = 1e8  # information of what is no unknown
 HELD = 1e6  # of the logarithm of a length that is held
 UNEXPLAINED = 0.4  # standard deviation of ends of what one solid does not explain, over its largest length
-SUDDEN = 0.3  # relative increase of the misfit over which that spread comes
+EXPLAINED, SUDDEN = 0.8, 0.5  # shares of the largest misfit: where that spread comes, and over which it grows
 PLACE, TURN, SIZE = 0.1, 0.4, 0.6  # standard deviations before the fit: [m], [rad], of logarithms of sizes
 LONGER = 1.3  # ratio of lengths that tells whether one is
 NEGLIGIBLE = 9.0  # logarithm of odds beyond which a hypothesis does not count
@@ -126,19 +127,22 @@ def fitted(
         settings: How much measurements say.
         known: Sizes that it may have, or others.
     """
-    best = _searched(patch, settings.most_misfit)
+    best = _searched(patch)
     if best is None:
         return None
-    factor, misfit = settings.inflation / settings.tempering, _misfit(best, patch)
+    factor = settings.inflation / settings.tempering
     sized = _of_known_size(best, patch, known)
     if sized is not None:
         return _honest(_estimate(sized, factor, seen), _misfit(sized, patch), settings)
     parts = _hypotheses(best, factor, patch, seen, settings)
     if best.start.kind == "box" and settings.cubes > 0.0 and _square(parts[0][1]):
         cube = _cube(best, patch)
+        if cube.fit.cost < best.fit.cost:  # cubes are boxes: the search ended in another minimum
+            best = min(best, _run(cube.solid, patch.fine, FINE_STEPS), key=_cost)
+            parts, cube = _hypotheses(best, factor, patch, seen, settings), _cube(best, patch)
         parts = [(one + float(np.log(1.0 - settings.cubes)), solid) for one, solid in parts]
         parts.append((cube.evidence + float(np.log(settings.cubes)), _estimate(cube, factor, seen)))
-    return _honest(mixture(parts), misfit, settings)
+    return _honest(mixture(parts), _misfit(best, patch), settings)
 
 
 def _misfit(found: _Found, patch: Patch) -> float:
@@ -151,9 +155,8 @@ def _honest(one: Estimate, misfit: float, settings: ObstacleSettings) -> Estimat
 
     Errors of both ends of an axis are independent: the center has half the variance of an end, the length twice that.
     """
-    unexplained = (
-        UNEXPLAINED * float(one.solid.size.max()) * min(1.0, max(0.0, misfit / settings.most_misfit - 1.0) / SUDDEN)
-    )
+    share = min(1.0, max(0.0, misfit / settings.most_misfit - EXPLAINED) / SUDDEN)
+    unexplained = UNEXPLAINED * float(one.solid.size.max()) * share
     variance = settings.systematic**2 + unexplained**2
     more = np.diag(np.concatenate([np.zeros(3), np.full(3, variance / 2.0), 2.0 * variance / one.solid.size**2]))
     return Estimate(one.solid, one.covariance + more, misfit)
@@ -178,14 +181,14 @@ def _hypotheses(
     return [(odds[k], _spread(_estimate(held[k], factor, seen), axis, STEP**2 / 12.0, side)) for k in likely]
 
 
-def _searched(patch: Patch, most_misfit: float) -> _Found | None:
+def _searched(patch: Patch) -> _Found | None:
     """Return the best fit from all starts; those of the other kind are tried again where it explains too little."""
     found = [_run(one, patch.coarse, FIRST_STEPS) for one in starts(patch.extent, patch.places, patch.normals)]
     least = min((one.fit.cost for one in found), default=np.inf)
     if not np.isfinite(least):
         return None
     best = _refined([one for one in found if one.fit.cost < HOPELESS * least], patch)
-    if best is None or _misfit(best, patch) > most_misfit:
+    if best is None or _misfit(best, patch) > DOUBTED:
         other = _refined([one for one in found if best is None or one.start.kind != best.start.kind], patch)
         best = min((one for one in (best, other) if one is not None), key=_cost, default=None)
     return None if best is None else min(best, _run(_grown(best.solid, GROWN), patch.fine, FINE_STEPS), key=_cost)

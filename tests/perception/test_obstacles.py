@@ -5,6 +5,7 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import coal
 import numpy as np
@@ -19,11 +20,13 @@ from apex_ompl.perception.synthetic import solid_part
 
 pytest.importorskip("cv2")
 
+from apex_ompl.perception import solid_fit  # noqa: E402
 from apex_ompl.perception.color_parts import Color, color_parts  # noqa: E402
 from apex_ompl.perception.obstacle_settings import ObstacleSettings  # noqa: E402
 from apex_ompl.perception.obstacles import ObstacleFinder, SeenObstacle  # noqa: E402
 from apex_ompl.perception.solid_fit import Estimate, KnownSize, mixture  # noqa: E402
-from apex_ompl.perception.solid_starts import Solid, starts  # noqa: E402
+from apex_ompl.perception.solid_pixels import Patch  # noqa: E402
+from apex_ompl.perception.solid_starts import Solid, resized, starts  # noqa: E402
 
 CAMERA = Camera(width=320, height=240, focal=(232.0, 232.0), center=(159.5, 119.5), depth=DepthErrors())
 EYE = look_at((1.0, 0.1, 0.9), (0.3, 0.0, 0.3))
@@ -233,6 +236,46 @@ def test_specks_of_the_color_do_not_widen_an_obstacle() -> None:
     found[part.top : part.top + part.own.shape[0], part.left : part.left + part.own.shape[1]] = part.own
     assert np.count_nonzero(found & ~own) == 0
     assert np.count_nonzero(own & ~found) <= 4
+
+
+def own_columns(depth: np.ndarray, red: np.ndarray) -> tuple[int, int]:
+    """Return the first and the last column of the nearest part of the color, of depths in a wider image."""
+    image = np.where(np.pad(red, 20)[..., None], (190, 10, 10), (90, 90, 90)).astype(np.uint8)
+    depths = np.pad(depth, 20, constant_values=2.0)
+    parts = color_parts(image, depths, Color(0.0, 18.0, 0.55, 0.08), noise=0.003, least=60, largest=0.3)
+    near = min(parts, key=lambda one: one.depth)
+    columns = np.flatnonzero(near.own.sum(axis=0) > 10) + near.left - 20
+    return int(columns[0]), int(columns[-1])
+
+
+def test_pixels_without_depth_are_no_part_of_the_nearer_of_two_surfaces() -> None:
+    """A stereo camera has no depth of what one of its eyes does not see: the farther surface, beside the nearer one."""
+    depth, red = np.full((40, 90), 1.5), np.ones((40, 90), bool)
+    depth[:, 20:30], depth[:, 30:60] = 0.0, 1.0
+    first, last = own_columns(depth, red)
+    assert 27 <= first <= 30
+    assert 59 <= last <= 61
+    red[:, :20] = False  # all that is seen of the farther surface is of another color
+    assert 27 <= own_columns(depth, red)[0] <= 30
+    depth[:, :20] = 0.7  # an occluder, which hides the part itself
+    assert 19 <= own_columns(depth, red)[0] <= 21
+
+
+def test_a_box_is_searched_again_where_a_cube_explains_it_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    solid, pose, size = CASES["cube"]
+    searched = solid_fit._searched
+
+    def too_long(patch: Patch) -> Any:
+        best = searched(patch)
+        assert best is not None
+        axis = solid_fit._front(best.solid)
+        return solid_fit._held(resized(best.solid, axis, 1.1 * float(best.solid.size[axis])), axis, patch.fine)
+
+    monkeypatch.setattr(solid_fit, "_searched", too_long)
+    (found,) = found_in([solid_part(solid, pose, 5, RED)], ObstacleSettings(cubes=1e-30))
+    np.testing.assert_allclose(found.size, size, atol=0.004)
+    off = found.pose[:3, 3] - pose[:3, 3]
+    assert off @ np.linalg.solve(found.covariance[3:6, 3:6], off) < 12.0
 
 
 def test_a_square_front_is_a_cube_as_far_as_cubes_are_expected() -> None:
