@@ -1,7 +1,8 @@
 """Sequences in random cells: pick and place with 50 grasps, a handover, and three boxes stacked with both hands.
 
 Each cell is planned as a whole, without going back (the nearest goal of each motion is taken, and the cell is lost
-where it does not suit the later steps), and without blends. Times are processor times of one process with a kept
+where it does not suit the later steps), without blends, and, as MoveIt's task constructor does it, with OMPL's
+RRTConnect for the motions between the same stages. Times are processor times of one process with a kept
 planner; the first cell of each kind is left out of them, and named beside them. Each run is stored in
 benchmarks/runs/cells when it ends; the command resumes where it was stopped.
 
@@ -30,7 +31,11 @@ from benchmarks.lib import record
 
 DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/constraints")
 FOLDER = record.RESULTS.parent / "runs" / "cells"
-ROWS = {"sequence": TaskSearch(), "without going back": TaskSearch(goes_back=False), "without blends": TaskSearch()}
+RIVAL = "rrtconnect+polish"
+ROWS = {
+    "sequence": TaskSearch(), "without going back": TaskSearch(goes_back=False), "without blends": TaskSearch(),
+    RIVAL: TaskSearch(),
+}  # fmt: skip
 COMPARED = "sequence", "without blends"  # by their makespans
 MOST_CAUSES = 4  # that a table names
 
@@ -49,7 +54,7 @@ def made(planner: MotionPlanner, kind: str, row: str, seed: int, timeout: float)
     cell = cells.draw(kind, seed)
     cell = without_blends(cell) if row == "without blends" else cell
     begin = time.process_time()
-    result = planner.plan_task(cell, timeout=timeout, seed=seed, search=ROWS[row])
+    result = planner.plan_task(cell, RIVAL if row == RIVAL else None, timeout=timeout, seed=seed, search=ROWS[row])
     spent = time.process_time() - begin
     return {
         "kind": kind, "row": row, "seed": seed, "solved": bool(result), "status": str(result.status), "cpu_s": spent,
