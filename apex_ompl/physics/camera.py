@@ -38,7 +38,7 @@ from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.util.validation import check_integer, check_number
 
 DEVIATIONS = 2.0  # of faces that have to be within the tolerance
-YIELD = 0.015  # by which fingers that yield may be off [m]
+YIELD = 0.03  # by which fingers that yield may be off [m]
 LOOKS = 3  # from other states, at most
 FRAMES, PERIOD = 9, 0.1  # of a look, and time between two of them [s]
 CUBE = 0.06, 0.14  # edges of drawn cubes [m]
