@@ -37,7 +37,7 @@ def can_meet(robot: Robot, start: Array, held: Sequence[AttachedObject], steps: 
             moved, onto = named[step.frame[0]], named[str(step.onto)]
             if not any(
                 _leaves_room(robot, start, onto, moved, together)
-                and _leaves_room(robot, start, moved, onto, np.linalg.inv(together))
+                and _leaves_room(robot, start, moved, onto, np.asarray(np.linalg.inv(together), float))
                 for together in _together(onto, moved, step.distance - SPARE)
             ):
                 return False
