@@ -29,6 +29,7 @@ from apex_ompl.perception.rig import RED, check_cameras, default_cameras, mispla
 from apex_ompl.perception.twin_camera import TwinCamera
 from apex_ompl.physics.execution import Executor
 from apex_ompl.physics.judges import Check
+from apex_ompl.physics.meeting import can_meet
 from apex_ompl.physics.result import FAILED, UNSEEN, TaskRun
 from apex_ompl.physics.runner import TIMEOUT, TaskRunner, unplanned
 from apex_ompl.physics.trials import Spread, Trial, draw
@@ -38,7 +39,7 @@ from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.util.validation import check_integer, check_number
 
 DEVIATIONS = 2.0  # of faces that have to be within the tolerance
-YIELD = 0.015  # by which fingers that yield may be off [m]
+YIELD = 0.03  # by which fingers that yield may be off [m]
 LOOKS = 3  # from other states, at most
 FRAMES, PERIOD = 9, 0.1  # of a look, and time between two of them [s]
 CUBE = 0.06, 0.14  # edges of drawn cubes [m]
@@ -200,6 +201,8 @@ class CameraRunner:
     def _held(self, real: Problem, known: Problem, rng: np.random.Generator) -> tuple[AttachedObject, ...]:
         """Return objects that are off in the hands, clear of the scene and of links that may not touch them.
 
+        The hands leave room for what lines bring onto the objects that they hold (:mod:`apex_ompl.physics.meeting`).
+
         Where there are none in some tries, they are where the problem has them.
         """
         start, names = known.start_state(self.robot.joint_names), {held.name for held in known.attached}
@@ -210,7 +213,8 @@ class CameraRunner:
                 held if held.links is not None or held.touch_links == () else off_in_hand(held, rng, self.grasps)
                 for held in solid
             )
-            if CollisionChecker(self.robot, real.scene, found, real.allowed).clearance(start) > least:
+            clear = CollisionChecker(self.robot, real.scene, found, real.allowed).clearance(start) > least
+            if clear and can_meet(self.robot, start, found, known.after):
                 return (*found, *liquid(real.model_copy(update={"attached": found})))
         return real.attached
 

@@ -2,7 +2,9 @@
 
 Each pair is of one seed. **Tasks**: ready-made problems in physics, with a red cube in the way, from starts whose
 joints differ by up to 0.02 rad, masses and friction by up to 20 %, and whose objects are off in the hands by standard
-deviations of (8, 8, 3) mm and (4, 4, 10) degrees, cut at two of these. Either objects and cube are seen by two cameras
+deviations of (8, 8, 3) mm and (4, 4, 10) degrees, cut at two of these; grasps are drawn again where a hand touches what
+a line brings onto the object in it, at any turn, as a peg that lies too far back in its hand: arms, cube and planner
+have no part in that. Either objects and cube are seen by two cameras
 of 640 x 480 pixels (drawn by MuJoCo, nine frames a look, noise and missing depths of a stereo camera, poses and depths
 off by the spreads of a calibration), with looks from other states where something is not known well enough; or they are
 told as they are. Tasks are judged by where the objects are at the end (:mod:`apex_ompl.physics.judges`), and fail where
