@@ -71,7 +71,7 @@ def held_shape(body: AttachedObject) -> HeldShape:
     """
     surface = body_surface(body)
     inflation = INFLATION[_kind_of(body, surface)]
-    return HeldShape(body, surface, _ties(body, surface), _symmetry(body, surface), inflation)
+    return HeldShape(body, surface, _ties(body, surface), symmetry(body, surface), inflation)
 
 
 def _ties(body: AttachedObject, surface: Surface) -> Indices:
@@ -84,12 +84,13 @@ def _ties(body: AttachedObject, surface: Surface) -> Indices:
     return np.array([0, 0, 2]) if abs(sides[0] - sides[1]) < 1e-3 * sides[0] else np.array([0, 1, 2])
 
 
-def _symmetry(body: AttachedObject, surface: Surface) -> int:
+def symmetry(body: AttachedObject, surface: Surface | None = None) -> int:
     """Return ``AXIS`` for a body of revolution about its z, whose vertices lie on rings, ``BALL`` or 0."""
     if body.sphere is not None:
         return BALL
     if body.box is not None:
         return 0
+    surface = surface or body_surface(body)
     radii = np.hypot(surface.vertices[:, 0], surface.vertices[:, 1])
     rings = np.round(np.stack([radii, surface.vertices[:, 2]], axis=1) / (ROUND * surface.radius))
     _, owner, count = np.unique(rings, axis=0, return_inverse=True, return_counts=True)

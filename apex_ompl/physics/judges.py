@@ -7,6 +7,7 @@ The checks are derived from the problem and from where its plan has the objects 
   aligned with, or on an obstacle below,
 - an object that is aligned with another one, or was brought onto its face, and is still held is so,
 - what stands on a tray stands on it,
+- of a body of revolution its axis counts, and of a ball its place alone,
 - a liquid is in the vessels that were to stay upright, or for the most part in the one that it was poured into,
 - no object is on the floor, liquids apart,
 - hands, or without hands the joints, are where the plan ends, and where none holds an object, no link touched an
@@ -23,6 +24,8 @@ import numpy as np
 from apex_ompl.drivers.grasps import turned
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.vessels import Vessel, filled, vessels
+from apex_ompl.kernel.perception import AXIS, BALL
+from apex_ompl.perception.held_shapes import symmetry
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import ALIGNMENT_DEFAULTS, Problem, Tolerance
@@ -127,10 +130,12 @@ class Judge:
 
     def _held(self, one: Intended) -> Check:
         pose = np.linalg.inv(self.driver.pose(one.link)) @ self.driver.pose(one.name)
-        return _near(f"{one.name} is held by {_hand(self.driver.robot, one.link)}", pose, one.pose, HELD, HELD_ANGLE)
+        what = f"{one.name} is held by {_hand(self.driver.robot, one.link)}"
+        return self._near(one.name, what, (pose, one.pose), HELD, HELD_ANGLE)
 
     def _placed(self, one: Intended) -> Check:
-        found = _near(f"{one.name} is where it was put", self.driver.pose(one.name), one.pose, PLACED, PLACED_ANGLE)
+        poses = self.driver.pose(one.name), one.pose
+        found = self._near(one.name, f"{one.name} is where it was put", poses, PLACED, PLACED_ANGLE)
         speed = self._speed(one.name)
         return Check(found.name, found.passed and speed < SPEED, f"{found.found}, {speed:.3f} m/s")
 
@@ -151,7 +156,18 @@ class Judge:
     def _stands(self, name: str) -> Check:
         carrier, first = self.standing[name]
         pose = np.linalg.inv(self.driver.pose(carrier)) @ self.driver.pose(name)
-        return _near(f"{name} stands on {carrier}", pose, first, STANDING, STANDING_ANGLE)
+        return self._near(name, f"{name} stands on {carrier}", (pose, first), STANDING, STANDING_ANGLE)
+
+    def _near(self, name: str, what: str, poses: tuple[Array, Array], most: float, most_angle: float) -> Check:
+        """Return whether the pose of an object is near a wanted one."""
+        pose, wanted = poses
+        kind = next((symmetry(one) for one in self.problem.attached if one.name == name), 0)
+        angle = turned(pose, wanted)
+        if kind == AXIS:
+            angle = float(np.arccos(np.clip(pose[:3, 2] @ wanted[:3, 2], -1.0, 1.0)))
+        distance = float(np.linalg.norm(pose[:3, 3] - wanted[:3, 3]))
+        passed = distance <= most and (angle <= most_angle or kind == BALL)
+        return Check(what, passed, f"{1e3 * distance:.1f} mm, {angle:.3f} rad off")
 
     def _aligned(self) -> Iterator[Check]:
         """Yield the check of two faces that are held at the end and were brought together last."""
@@ -220,12 +236,6 @@ class Judge:
     def _speed(self, name: str) -> float:
         at = self.driver.twin.model.joint(name).dofadr[0]
         return float(np.linalg.norm(self.driver.data.qvel[at : at + 3]))
-
-
-def _near(what: str, pose: Array, wanted: Array, most: float, most_angle: float) -> Check:
-    distance, angle = float(np.linalg.norm(pose[:3, 3] - wanted[:3, 3])), turned(pose, wanted)
-    passed = distance <= most and angle <= most_angle
-    return Check(what, passed, f"{1e3 * distance:.1f} mm, {angle:.3f} rad off")
 
 
 def _hand(robot: Robot, link: str) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from physics import library
 from planning import cached_problem
@@ -64,6 +65,19 @@ def test_what_is_held_is_where_the_hand_has_it(robot: Robot) -> None:
     turned = first.copy()
     turned[:3, :3] = first[:3, :3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert scene.put("upper", turned).failed() == {"upper is held by right_hand"}
+
+
+@pytest.mark.parametrize(("problem", "name", "round_about"), [("pour", "empty", "z"), ("ball_in_cup", "ball", "xz")])
+def test_a_turn_of_a_round_object_about_its_axis_is_none(
+    robot: Robot, problem: str, name: str, round_about: str
+) -> None:
+    scene = Scene(robot, cached_problem(problem))
+    first, before = scene.driver.pose(name), scene.failed()
+    for about in "xz":
+        turn = np.eye(4)
+        turn[:3, :3] = pin.utils.rotate(about, 1.0)
+        lost = {one for one in scene.put(name, first @ turn).failed() - before if f"{name} is held by" in one}
+        assert bool(lost) == (about not in round_about)
 
 
 def test_no_object_may_lie_on_the_floor(robot: Robot) -> None:
