@@ -466,6 +466,7 @@ def _use_fits() -> None:
         assert isinstance(seen, SeenObstacle) and seen.place_spread > 0.0 and seen.obstacle("red", 1.0).name == "red"
     for tracked in tracker.update(frame.stamp, found, given):
         assert isinstance(tracked, TrackedObstacle) and tracked.place_covariance.shape == (3, 3)
+        assert 0.0 < tracked.speed_deviation <= 0.2 + 1e-9
         assert tracked.obstacle(2.0).name == tracked.solid.name == tracked.name and not tracker.gone
         size = tracked.known_size()
         assert isinstance(size, KnownSize) and obstacles.find(given, frame.color, known=[size])

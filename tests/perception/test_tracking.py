@@ -112,6 +112,7 @@ def test_normalized_errors_of_moving_obstacles_are_chi_squared() -> None:
             shared = kept * shared + np.sqrt(1.0 - kept**2) * rng.normal(size=9)
             last = place - dt * velocity
         off = np.concatenate([last - found.pose[:3, 3], SIZE - found.size, velocity - found.velocity])
+        assert found.speed_deviation == pytest.approx(np.linalg.norm(found.covariance[9:, 9:], 2) ** 0.5)
         squares.append(float(off @ np.linalg.solve(found.covariance[3:, 3:], off)) / 9.0)
     band = 1.96 * np.sqrt(2.0 / (9 * len(squares)))
     assert abs(np.mean(squares) - 1.0) < band + 0.05  # the place moved on by a step of noise
