@@ -36,8 +36,8 @@ class Guard:
     A hand that holds an object is where the object lets it be, so that hands are not guarded by default.
 
     Attributes:
-        start: Largest distance of the start of a motion from the measured position of a robot at rest; one that moves
-            may be off as in ``tracking`` [rad].
+        start: Largest distance of the start of a motion from the measured position of a robot at rest; one that moves,
+            or did in the last 0.1 s, may be off as in ``tracking`` [rad].
         tracking: Largest distance of the measured from the commanded position [rad].
         hand_start: As ``start``, of hands [synergies 0..1].
         hand_tracking: As ``tracking``, of hands.

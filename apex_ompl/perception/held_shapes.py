@@ -85,10 +85,20 @@ def _ties(body: AttachedObject, surface: Surface) -> Indices:
 
 
 def symmetry(body: AttachedObject, surface: Surface | None = None) -> int:
-    """Return ``AXIS`` for a body of revolution about its z, whose vertices lie on rings, ``BALL`` or 0."""
+    """Return ``AXIS`` for a body of revolution about its z, ``BALL`` or 0; vertices of round meshes lie on rings.
+
+    Args:
+        body: The body.
+        surface: Its surface, where that is known.
+
+    Raises:
+        ApexError: The file of its mesh cannot be read.
+    """
     if body.sphere is not None:
         return BALL
-    if body.box is not None:
+    if body.cylinder is not None or body.capsule is not None:
+        return AXIS
+    if body.mesh is None:
         return 0
     surface = surface or body_surface(body)
     radii = np.hypot(surface.vertices[:, 0], surface.vertices[:, 1])

@@ -10,13 +10,12 @@ import pinocchio as pin
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.drivers.grasps import hands_of
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Obstacle, given_fields, pose_fields
+from apex_ompl.scene.bodies import HOLDING, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.steps import LineStep, Step
 from apex_ompl.types import Array
 
 SPARE = 0.0015  # by which the objects go further than the line [m]
 TURNS = 24  # about the common axis of the faces
-OF_GRASP = ("link", "links", "touch_links", "contact", "mass", "inertia")  # fields that obstacles do not have
 
 
 def can_meet(robot: Robot, start: Array, held: Sequence[AttachedObject], steps: Sequence[Step]) -> bool:
@@ -67,7 +66,7 @@ def _face(one: AttachedObject) -> Array:
 def _leaves_room(robot: Robot, start: Array, held: AttachedObject, other: AttachedObject, pose: Array) -> bool:
     """Whether the hand that holds an object touches nothing of another one at a pose in the frame of the former."""
     world = robot.link_pose(start, held.link) @ held.pose @ pose
-    there = Obstacle.model_validate({**given_fields(other, OF_GRASP), **pose_fields(world)})
+    there = Obstacle.model_validate({**given_fields(other, HOLDING), **pose_fields(world)})
     links = {link for hand in hands_of(robot, held) for link in robot.hand_of(robot.hands[hand].palm)}
     contacts = CollisionChecker(robot, [there]).contacts(start)
     return not any(other.name in (one.first, one.second) and links & {one.first, one.second} for one in contacts)

@@ -19,7 +19,7 @@ from apex_ompl.planning.line_query import tools_of
 from apex_ompl.planning.query import planned_joints
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
-from apex_ompl.scene.bodies import MOTION, AttachedObject, Body, Obstacle, given_fields, pose_fields
+from apex_ompl.scene.bodies import HOLDING, MOTION, AttachedObject, Body, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import AnyStep, Goal, MoveStep, Problem
 from apex_ompl.scene.steps import (
     AddStep,
@@ -42,7 +42,6 @@ from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 
 Pair = tuple[str, str]
-HELD = ("link", "links", "touch_links")  # fields that an object has only while it is held
 
 
 @dataclass(frozen=True)
@@ -201,12 +200,12 @@ class TaskWorld:
             others = [link for link in one.holders if link not in mine]
             if others:
                 inside = np.linalg.inv(self.robot.link_pose(q, others[0])) @ pose
-                fields: dict[str, Any] = given_fields(one, ("link", "links", "touch_links"))
+                fields: dict[str, Any] = given_fields(one, HOLDING)
                 held[name] = _read(AttachedObject, {**fields, "link": others[0], **pose_fields(inside)})
             elif falls:
                 gone.add(name)
             else:
-                scene[name] = _read(Obstacle, {**given_fields(one, HELD), **pose_fields(pose)})
+                scene[name] = _read(Obstacle, {**given_fields(one, HOLDING), **pose_fields(pose)})
         allowed = frozenset(pair for pair in self.allowed if not gone & {*pair})
         leaving = self.leaving
         if hand is not None:

@@ -16,7 +16,7 @@ from apex_ompl.errors import FileFormatError, SceneError
 from apex_ompl.planning.cloud_files import CloudFiles, cloud_of
 from apex_ompl.planning.query import State, check_problem, state_array
 from apex_ompl.robot import load_robot
-from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
+from apex_ompl.scene.bodies import HOLDING, MOTION, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
@@ -294,7 +294,7 @@ class World:
             held, left = self.held.get(name) if isinstance(name, str) else None, list[Obstacle]()
             if q is not None and held is not None:
                 pose = self.checker.robot.link_pose(q, held.link) @ held.pose
-                shape = given_fields(held, ("link", "links", "touch_links"))
+                shape = given_fields(held, HOLDING)
                 left = [self._read(Obstacle, {**shape, **pose_fields(pose)}, "obstacle")]
             self.checker.detach(name)
             self._add(left)

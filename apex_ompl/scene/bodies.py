@@ -200,6 +200,7 @@ BodyT = TypeVar("BodyT", bound=Body)
 SHAPES = ("box", "sphere", "cylinder", "capsule", "mesh", "points", "voxels", "distance_grid", "half_space")
 SOLID = ("name", *SHAPES, "orientation")  # fields of a solid that do not change as it moves
 MOTION = ("velocity", "trajectory", "appears")  # fields of the motion of an obstacle
+HOLDING = ("link", "links", "touch_links")  # fields that an object has only while it is held
 FILES = ("mesh", "points", "voxels", "distance_grid")  # shapes that are read from files
 
 

@@ -318,7 +318,9 @@ def _use_run() -> None:
     settings = apex_ompl.LoopSettings(error=0.01, fastest=0.3)
     ball = apex_ompl.Obstacle(name="ball", sphere={"radius": 0.05}, position=(1.5, 1.5, 1.0))
     with apex_ompl.Loop(problem, settings=settings) as loop:
-        loop.observe(0.0, [ball], errors={"ball": 1e-4 * np.eye(3)}, clouds={"camera": np.full((5, 3), 2.0)})
+        told = {"ball": ((0.1, 0.0, 0.0), 0.05)}
+        clouds = {"camera": np.full((5, 3), 2.0)}
+        loop.observe(0.0, [ball], errors={"ball": 1e-4 * np.eye(3)}, clouds=clouds, velocities=told)
         command = loop.step(0.0, problem.start_state(loop.joint_names))
         assert command is not None and command.rests and loop.outcome is None and loop.record is None
         assert loop.missed() is not None
