@@ -14,7 +14,10 @@ from apex_ompl.errors import UnknownNameError
 from apex_ompl.kernel import FixedVector, IKSolver, RobotTables, Target
 from apex_ompl.kernel.robot_builder import robot_tables
 from apex_ompl.robot import Robot
+from apex_ompl.types import Array
 from apex_ompl.util.forking import ProcessLock
+
+MOST_VECTORS = 4096  # that are kept
 
 
 def in_world(vector: ArrayLike) -> FixedVector:
@@ -36,6 +39,7 @@ class Links:
         frames = (f for f in robot.model.frames if f.type == pin.FrameType.BODY)
         self._placements = {f.name: (int(f.parentJoint), f.placement.copy()) for f in frames}
         self._turns = [turn[:3, :3] for turn in tree.turns]
+        self._vectors = dict[tuple[str, bytes, bool], FixedVector]()
         limits = robot.limits
         self.tables: RobotTables = robot_tables(
             robot.name, robot.joint_names, lower=limits.lower, upper=limits.upper, tree=tree, bodies=[], pairs=[],
@@ -56,8 +60,7 @@ class Links:
         Raises:
             UnknownNameError: No such link.
         """
-        joint, placement = self._placement(link)
-        return FixedVector(joint, self._turns[joint].T @ placement.act(np.asarray(point, float)))
+        return self._fixed(link, np.asarray(point, float), is_point=True)
 
     def direction(self, link: str, direction: ArrayLike) -> FixedVector:
         """Return a unit direction given in the frame of a link, shape (3,).
@@ -65,8 +68,7 @@ class Links:
         Raises:
             UnknownNameError: No such link.
         """
-        joint, placement = self._placement(link)
-        return FixedVector(joint, self._turns[joint].T @ placement.rotation @ np.asarray(direction, float))
+        return self._fixed(link, np.asarray(direction, float), is_point=False)
 
     def frame(self, link: str, pose: pin.SE3) -> tuple[int, pin.SE3]:
         """Return the joint of a frame given in that of a link, and its pose in the joint's frame [m].
@@ -92,6 +94,18 @@ class Links:
     def inverse(self, targets: Sequence[Target], fixed: Sequence[int] | NDArray[np.intp] = ()) -> IKSolver:
         """Return the inverse kinematics of targets; the planned joints with indices ``fixed`` are not moved."""
         return IKSolver(self.tables, targets, fixed)
+
+    def _fixed(self, link: str, vector: Array, *, is_point: bool) -> FixedVector:
+        key = link, vector.tobytes(), is_point
+        found = self._vectors.get(key)
+        if found is None:
+            joint, placement = self._placement(link)
+            inside = placement.act(vector) if is_point else placement.rotation @ vector
+            found = FixedVector(joint, self._turns[joint].T @ inside)
+            if len(self._vectors) >= MOST_VECTORS:
+                self._vectors.clear()
+            self._vectors[key] = found
+        return found
 
     def _placement(self, link: str) -> tuple[int, pin.SE3]:
         if link not in self._placements:

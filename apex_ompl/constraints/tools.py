@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.arrays import FIXED, PRISMATIC
 from apex_ompl.kernel.products import product
+from apex_ompl.kernel.tool_poses import DAMPING, LEAST_PIVOT, LEAST_SQUARE, ToolSolver
 from apex_ompl.types import Array, Flags
 
-DAMPING = 1e-10  # lambda of the pseudoinverse J^T (J J^T + lambda I)^-1
-CLOSED = 1e-10  # error at which Newton's method ends [m, rad]
-LARGEST_STEP = 0.4  # of Newton's method [rad]
-LEAST_PIVOT = 1e-14
 NULL = 1e-6  # least square of a column of the projector, for there to be a null space
 
 
@@ -87,6 +84,8 @@ class Tools:
             self._selections.append(selection)
             self._prismatic.append(arrays.joint_kind[chain] == PRISMATIC)
             self._arms.append(np.array(arms))
+        poses = np.array([tool.pose for tool in tools]).reshape(-1, 4, 4)
+        self._solver = ToolSolver(kernel.robot, [t.joint for t in tools], poses, [t.columns for t in tools])
 
     def poses(self, q: Array) -> tuple[Array, Array]:
         """Return rotations, shape (N, F, 3, 3), and origins, shape (N, F, 3) [m], of F tools at states, (N, dof)."""
@@ -118,24 +117,7 @@ class Tools:
             point: Wanted origins, shape (N, F, 3) [m].
             steps: Most steps.
         """
-        q, ok, rows = q.copy(), np.zeros(len(q), bool), np.arange(len(q))
-        for count in range(steps + 1):
-            frames = self.kernel.joint_frames(q[rows])
-            turned, placed = self._placed(frames)
-            error = pose_errors(turned, placed, rotation[rows], point[rows])
-            left = np.abs(error).max(axis=(1, 2)) > CLOSED
-            ok[rows[~left]] = True
-            if count == steps or not left.any():
-                break
-            rows, error, placed = rows[left], error[left], placed[left]
-            frames = frames[0][left], frames[1][left]
-            for f, tool in enumerate(self.tools):
-                jacobian, factor = self._linearized(f, frames, placed[:, f])
-                step = product(_transposed(jacobian), solved(factor, error[:, f, :, None]))[..., 0]
-                size = np.abs(step).max(axis=1)
-                step *= np.minimum(1.0, LARGEST_STEP / np.maximum(size, LARGEST_STEP))[:, None]
-                q[rows[:, None], tool.columns] += step
-        return q, ok
+        return self._solver.close(q, rotation, point, steps)
 
     def bends(self, f: int, velocity: Array, acceleration: Array) -> tuple[Array, Array, Array]:
         """Return bounds of a tool's acceleration, angular velocity and angular acceleration.
@@ -211,7 +193,7 @@ def pose_errors(rotation: Array, point: Array, wanted_rotation: Array, wanted_po
         cosine = cosine + 0.5 * (a * b).sum(axis=-1)
     square = (turn * turn).sum(axis=-1)
     far = np.asarray(cosine) < 0.0  # more than a quarter of a turn
-    scale = np.where(far, 1.0 / np.sqrt(np.maximum(square, 1e-6)), 1.0 + square / 6.0)
+    scale = np.where(far, 1.0 / np.sqrt(np.maximum(square, LEAST_SQUARE)), 1.0 + square / 6.0)
     return np.concatenate([wanted_point - point, scale[..., None] * turn], axis=-1)
 
 

@@ -8,7 +8,8 @@ region is a goal of this kind as well: poses that are drawn in the region.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -81,12 +82,34 @@ class AnyGoal:
         turned = self.robot.turned_to(self.states, q)
         reached = bool((np.abs(turned - q).max(axis=1, initial=0.0) <= single.TOLERANCE).any())
         least = 0.0 if reached else np.inf
-        for goal in self.members:
+        for _, errors, bounds in self._errors(q):
             if not least:
                 break
-            errors, bounds = goal.errors(q), goal.bounds
             least = 0.0 if within(errors, bounds) else min(least, relative_error(errors, bounds))
         return {ANY: least}
+
+    def _errors(self, q: Array) -> Iterator[tuple[int, Mapping[str, float], Mapping[str, float]]]:
+        """Yield number, errors at a state and bounds of each goal; of those with the same poses, of the first alone."""
+        placed = dict[object, list[Array]]()
+        for k in self._distinct:
+            goal = self.members[k]
+            if isinstance(goal, PoseGoal):
+                if goal.where not in placed:
+                    placed[goal.where] = goal.placements(q)
+                yield k, goal.errors(q, placed[goal.where]), goal.bounds
+            else:
+                yield k, goal.errors(q), goal.bounds
+
+    @cached_property
+    def _distinct(self) -> list[int]:
+        """Numbers of the goals, without those that differ from one before in what inverse kinematics is to reach."""
+        found, before = list[int](), None
+        for k, goal in enumerate(self.members):
+            poses = goal.poses if isinstance(goal, PoseGoal) else None
+            if poses is None or poses is not before:
+                found.append(k)
+            before = poses
+        return found
 
     def nearest_states(self, checker: CollisionChecker, rng: np.random.Generator, count: int) -> Array:
         """Return free states that reach goals, by a few descents for each: the nearest of each goal in turn.
@@ -109,7 +132,7 @@ class AnyGoal:
 
     def member_of(self, q: Array) -> int:
         """Return the number of the first goal that a state, shape (dof,), reaches, or -1 of a joint configuration."""
-        return next((k for k, goal in enumerate(self.members) if within(goal.errors(q), goal.bounds)), -1)
+        return next((k for k, errors, bounds in self._errors(q) if within(errors, bounds)), -1)
 
     def sample(
         self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200

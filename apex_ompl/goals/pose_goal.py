@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +14,7 @@ from apex_ompl.constraints.links import Links, in_world
 from apex_ompl.errors import ParameterError
 from apex_ompl.goals.alignment import angle, within
 from apex_ompl.goals.reach import too_far
-from apex_ompl.kernel import Target, offset_target, opposition_target
+from apex_ompl.kernel import IKSolver, Target, offset_target, opposition_target
 from apex_ompl.kernel.products import product
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject, pose_matrix
@@ -34,17 +36,14 @@ class PoseGoal:
 
     def __init__(
         self, robot: Robot, poses: Sequence[PoseTarget], attached: Sequence[AttachedObject], start: Array,
-        drawn: Sequence[PoseTarget] = (),
     ) -> None:  # fmt: skip
-        """Find the frames and prepare inverse kinematics.
+        """Find the frames.
 
         Args:
             robot: The robot.
             poses: The poses.
             attached: The held objects.
             start: The start, shape (dof,).
-            drawn: Poses inside of the regions of ``poses`` that inverse kinematics is to reach; by default the given
-                ones.
 
         Raises:
             UnknownNameError: A frame is not a hand, a link or a held object.
@@ -58,13 +57,35 @@ class PoseGoal:
         for pose, frame in zip(self.poses, self.frames, strict=True):
             if frame.axial and (pose.free_turn not in (None, "z") or pose.turn is not None):
                 raise ParameterError("free_turn", pose.free_turn, f"z and no turn for {pose.frame}, a contact face")
-        self._drawn = tuple(drawn) or self.poses
+        self._drawn = self.poses
         self._numbers = [robot.link_frame(frame.link) for frame in self.frames]
         self._data: pin.Data | None = None  # made when it is needed
         self._lock = ProcessLock()  # of the data
+
+    def drawn(self, poses: Sequence[PoseTarget]) -> PoseGoal:
+        """Return the same goal, of which inverse kinematics is to reach given poses inside of the regions."""
+        other = copy(self)
+        other._drawn = tuple(poses)
+        other.__dict__.pop("inverse", None)
+        return other
+
+    @cached_property
+    def inverse(self) -> IKSolver:
+        """Inverse kinematics of the poses; hands stay as they are."""
+        robot = self.robot
         names = [h.synergy for h in robot.hands.values() if h.synergy is not None]
         hands = np.array([robot.joint_names.index(name) for name in names], dtype=np.intp)
-        self.inverse = Links.of(robot).inverse(self.targets(), hands)
+        return Links.of(robot).inverse(self.targets(), hands)
+
+    @cached_property
+    def _wanted(self) -> list[Array]:
+        """The poses, shape (4, 4) each [m]."""
+        return [pose_matrix(pose.position, pose.orientation or (0.0, 0.0, 0.0, 1.0)) for pose in self.poses]
+
+    @cached_property
+    def where(self) -> tuple[tuple[str, bytes], ...]:
+        """The frames: two goals for which this is the same have frames in the same places."""
+        return tuple((frame.link, frame.pose.tobytes()) for frame in self.frames)
 
     def placements(self, q: Array) -> list[Array]:
         """Return the poses of the frames in the world at a state, shape (4, 4) each [m]."""
@@ -74,11 +95,15 @@ class PoseGoal:
             links = [np.array(self._data.oMf[number].homogeneous) for number in self._numbers]
         return [link @ frame.pose for link, frame in zip(links, self.frames, strict=True)]
 
-    def errors(self, q: Array) -> dict[str, float]:
-        """Return the error terms at a state, shape (dof,): distances [m] and angles [rad]."""
-        errors = {}
-        for pose, frame, found in zip(self.poses, self.frames, self.placements(q), strict=True):
-            wanted = pose_matrix(pose.position, pose.orientation or (0.0, 0.0, 0.0, 1.0))
+    def errors(self, q: Array, placed: Sequence[Array] | None = None) -> dict[str, float]:
+        """Return the error terms at a state, shape (dof,): distances [m] and angles [rad].
+
+        Args:
+            q: The state.
+            placed: Its :meth:`placements`, where they are known.
+        """
+        errors, placed = {}, self.placements(q) if placed is None else placed
+        for pose, frame, found, wanted in zip(self.poses, self.frames, placed, self._wanted, strict=True):
             inside = wanted[:3, :3].T @ (found[:3, 3] - wanted[:3, 3])
             outside = inside - np.clip(inside, pose.lower, pose.upper)
             errors[f"position of {pose.frame}"] = float(np.linalg.norm(outside))
@@ -177,7 +202,7 @@ def pose_goals(
     placed, turns = goal.placements(goal.start), len(goal.inverse.free) >= TURNING
     for k in range(DRAWN):
         drawn = [_drawn(pose, found, rng if k else None, turns) for pose, found in zip(poses, placed, strict=True)]
-        goals.append(PoseGoal(robot, poses, attached, start, drawn))
+        goals.append(goal.drawn(drawn))
     return goals
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -110,6 +111,28 @@ def angle_target(first: FixedVector, second: FixedVector, cosine: float = 0.0, w
     return Target(ANGLE, (first, second, NOTHING), float(cosine), float(weight))
 
 
+@lru_cache(maxsize=256)
+def _moving(
+    parents: bytes, sources: bytes, joints: tuple[int, ...], fixed: tuple[int, ...]
+) -> tuple[Integers, Integers]:
+    """Return the joints above some and they themselves, and the planned joints that move them, without fixed ones.
+
+    Args:
+        parents: Parent of each joint, as bytes of integers, which can be keys of a cache.
+        sources: Planned joint of each, or -1.
+        joints: The joints.
+        fixed: The planned joints that are left out.
+    """
+    parent, source, above = np.frombuffer(parents, np.int64), np.frombuffer(sources, np.int64), set[int]()
+    for joint in joints:
+        k = joint
+        while k > 0 and k not in above:
+            above.add(k)
+            k = int(parent[k])
+    moved = {int(source[j]) for j in above} - {-1}
+    return np.array(sorted(above), np.int64), np.array(sorted(moved - set(fixed)), np.int64)
+
+
 class IKDescents(NamedTuple):
     """Ends of descents.
 
@@ -151,15 +174,9 @@ class IKSolver:
             weight=np.array([target.weight for target in targets]),
         )
         self._targets = pack(arrays_of_targets)
-        above: set[int] = set()
-        for joint in joints:
-            k = joint
-            while k > 0 and k not in above:
-                above.add(k)
-                k = int(arrays.joint_parent[k])
-        self._chain = np.array(sorted(above), np.int64)
-        moved = {int(arrays.joint_source[j]) for j in above} - {-1}
-        self.free = np.array(sorted(moved - {int(k) for k in fixed}), np.int64)
+        structure = arrays.joint_parent.tobytes(), arrays.joint_source.tobytes()
+        moving = _moving(*structure, tuple(joints), tuple(int(k) for k in fixed))
+        self._chain, self.free = (array.copy() for array in moving)  # which users of these may change
         self._workspace_sizes = workspace_sizes(arrays)
         self._buffer_sizes = ik_buffer_sizes(robot.dof, len(self.free))
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, LIMIT_SLACK, PRISMATIC, REVOLUTE
+from apex_ompl.kernel.compiled.geometry.enclosing_ball import enclose
 from apex_ompl.kernel.products import product
 from apex_ompl.kernel.tables import BodySpec, JointSpec
 from apex_ompl.types import Array
@@ -52,103 +54,6 @@ class Member(NamedTuple):
     outer: Array
 
 
-def cluster_ball(
-    members: Sequence[Member],
-    top: int,
-    inner: Sequence[int],
-    joints: Sequence[JointSpec],
-    placements: Sequence[Array],
-    limits: tuple[float, float] | None,
-) -> ClusterBall:
-    """Return the ball around a cluster.
-
-    Inner joints are sampled over their range; between two samples a center moves by at most its speed times half the
-    spacing.
-
-    Args:
-        members: Bodies of the cluster.
-        top: Joint of the cluster.
-        inner: Its inner joints, parents first.
-        joints: All joints.
-        placements: Poses of all joints in their parents, with their axes along z.
-        limits: Range of the planned joint that drives the inner joints, None where there is none.
-    """
-    low, high = limits or (0.0, 0.0)
-    values = np.zeros(1) if limits is None else np.linspace(low, high, SAMPLES)
-    points = _points(members, top, inner, joints, placements, values)
-    radii = np.concatenate([m.radii for m in members])
-    roots = np.concatenate([np.arange(len(m.radii)) == 0 for m in members])
-    speeds = np.concatenate([_speed(m, top, joints, placements, (low, high)) for m in members])
-    slack = 0.0 if limits is None else speeds * (high - low) / (SAMPLES - 1) / 2.0
-    center = _middle(points[:, roots], (radii + slack)[roots])
-    away = np.linalg.norm(points - center, axis=2).max(axis=0) + slack
-    leaves = np.concatenate([m.outer for m in members])
-    # The roots contain the solids; the leaves and inner nodes are what moves.
-    return ClusterBall(
-        center, float((away + radii)[roots].max()) + 1e-9, float((away + leaves)[roots].max()) + 1e-9,
-        float(away.max()) + 1e-9, float(speeds.max()),
-    )  # fmt: skip
-
-
-def part_balls(
-    members: Sequence[Member],
-    top: int,
-    inner: Sequence[int],
-    joints: Sequence[JointSpec],
-    placements: Sequence[Array],
-    limits: tuple[float, float] | None,
-) -> tuple[Array, Array]:
-    """Return balls around a part of a cluster for each of BINS ranges of values, from the lowest limit to the highest.
-
-    Args are those of :func:`cluster_ball`, but for the limits, which are the robot's own and hold within LIMIT_SLACK.
-
-    Returns:
-        Centers and radii around the solids, shape (BINS, 4), and radii around the leaf spheres, shape (BINS,) [m].
-    """
-    low, high = limits or (0.0, 0.0)
-    roots = [Member(m.joint, m.centers[:1], m.radii[:1], m.outer[:1]) for m in members]
-    points = _points(roots, top, inner, joints, placements, np.linspace(low, high, SAMPLES))
-    speeds = np.concatenate([_speed(m, top, joints, placements, (low, high)) for m in roots])
-    slack = speeds * ((high - low) / (SAMPLES - 1) / 2.0 + LIMIT_SLACK)
-    rows = OF_BIN * np.arange(BINS)[:, None] + np.arange(OF_BIN + 1)
-    within = points[rows]  # (BINS, OF_BIN + 1, bodies, 3)
-    radii, leaves = np.concatenate([m.radii for m in roots]), np.concatenate([m.outer for m in roots])
-    wide = (radii + slack)[:, None]
-    center = 0.5 * ((within - wide).min(axis=(1, 2)) + (within + wide).max(axis=(1, 2)))
-    away = np.linalg.norm(within - center[:, None, None], axis=3).max(axis=1) + slack
-    return np.column_stack([center, (away + radii).max(axis=1) + 1e-9]), (away + leaves).max(axis=1) + 1e-9
-
-
-def _points(
-    members: Sequence[Member], top: int, inner: Sequence[int], joints: Sequence[JointSpec],
-    placements: Sequence[Array], values: Array,
-) -> Array:  # fmt: skip
-    """Return the centers of all spheres at values of the inner joints, in the frame of the cluster's, (N, n, 3)."""
-    poses = {top: np.tile(np.eye(4), (len(values), 1, 1))}
-    for k in inner:
-        poses[k] = product(product(poses[joints[k].parent], placements[k]), _motions(joints[k], values))
-    return np.concatenate([transformed(poses[m.joint], m.centers) for m in members], axis=1)
-
-
-def _speed(
-    body: Member, top: int, joints: Sequence[JointSpec], placements: Sequence[Array], limits: tuple[float, float]
-) -> Array:
-    """Bound the speed of a body's spheres relative to the cluster's joint, per unit of the planned joint."""
-    reach = np.linalg.norm(body.centers, axis=1)
-    speed = np.zeros(len(reach))
-    k = body.joint
-    while k != top:
-        joint = joints[k]
-        if joint.kind == REVOLUTE:
-            speed += abs(joint.ratio) * reach
-        elif joint.kind == PRISMATIC:
-            speed += abs(joint.ratio)
-            reach = reach + max(abs(joint.ratio * v + joint.shift) for v in limits)
-        reach = reach + np.linalg.norm(placements[k][:3, 3])
-        k = joint.parent
-    return speed
-
-
 def _motions(joint: JointSpec, q: Array) -> Array:
     """Return the motion of a joint at values of its planned joint, shape (N, 4, 4)."""
     poses = np.tile(np.eye(4), (len(q), 1, 1))
@@ -173,25 +78,6 @@ def leaf_radii(centers: Array, radii: Array, body: BodySpec) -> Array:
         at = above[at]
         leaves, at = leaves[at >= 0], at[at >= 0]
     return outer + 1e-12
-
-
-def _middle(points: Array, radii: Array) -> Array:
-    """Return the approximate center of the smallest ball around balls at points (..., n, 3) with radii (n,).
-
-    By steps towards the farthest ball (Badoiu and Clarkson 2003).
-    """
-    flat = points.reshape(-1, 3)
-    wide = np.broadcast_to(radii, points.shape[:-1]).ravel()
-    center: Array = flat.mean(axis=0)
-    for step in range(1, 100):
-        offsets = flat - center
-        lengths = np.sqrt(np.einsum("ij,ij->i", offsets, offsets))
-        k = int(np.argmax(lengths + wide))
-        long = float(lengths[k])
-        if long == 0.0:
-            break
-        center = center + offsets[k] / long * (long + wide[k]) / (step + 1) * 0.5
-    return center
 
 
 def transformed(pose: Array, points: Array) -> Array:
@@ -258,18 +144,113 @@ class JointTree:
     def ball(
         self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float] | None
     ) -> ClusterBall:
-        """Return the ball of :func:`apex_ompl.kernel.cluster_balls.cluster_ball`; it is kept."""
+        """Return the ball around a cluster; it is kept.
+
+        Inner joints are sampled over their range; between two samples a center moves by at most its speed times half
+        the spacing.
+
+        Args:
+            members: Bodies of the cluster.
+            top: Joint of the cluster.
+            inner: Its inner joints, parents first.
+            limits: Range of the planned joint that drives the inner joints, None where there is none.
+        """
         content = tuple((m.joint, m.centers.tobytes(), m.radii.tobytes(), m.outer.tobytes()) for m in members)
         key = top, tuple(inner), limits, content
-        return self._kept(key, lambda: cluster_ball(members, top, inner, self.joints, self.placements, limits))
+        return self._kept(key, lambda: self._ball(members, top, inner, limits))
+
+    def _ball(
+        self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float] | None
+    ) -> ClusterBall:
+        low, high = limits or (0.0, 0.0)
+        points = self._points(members, top, inner, (low, high), 1 if limits is None else SAMPLES)
+        radii = np.concatenate([m.radii for m in members])
+        roots = np.cumsum([0, *(len(m.radii) for m in members[:-1])])
+        speeds = np.concatenate([self._speed(m, top, (low, high)) for m in members])
+        slack = np.zeros(len(radii)) if limits is None else speeds * (high - low) / (SAMPLES - 1) / 2.0
+        center, away = np.empty(3), np.empty(len(radii))
+        enclose(points, roots, (radii + slack)[roots], center, away)
+        away += slack
+        leaves = np.concatenate([m.outer for m in members])
+        # The roots contain the solids; the leaves and inner nodes are what moves.
+        return ClusterBall(
+            center, float((away + radii)[roots].max()) + 1e-9, float((away + leaves)[roots].max()) + 1e-9,
+            float(away.max()) + 1e-9, float(speeds.max()),
+        )  # fmt: skip
 
     def part_balls(
         self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float] | None
     ) -> tuple[Array, Array]:
-        """Return the balls of :func:`apex_ompl.kernel.cluster_balls.part_balls`; they are kept."""
+        """Return balls around a part of a cluster for each of BINS ranges of values; they are kept.
+
+        Args are those of :meth:`ball`, but for the limits, which are the robot's own and hold within LIMIT_SLACK.
+
+        Returns:
+            Centers and radii around the solids, shape (BINS, 4), from the lowest limit to the highest, and radii around
+            the leaf spheres, shape (BINS,) [m].
+        """
         content = tuple((m.joint, *(array[:1].tobytes() for array in m[1:])) for m in members)
         key = "part", top, tuple(inner), limits, content
-        return self._kept(key, lambda: part_balls(members, top, inner, self.joints, self.placements, limits))
+        return self._kept(key, lambda: self._part_balls(members, top, inner, limits))
+
+    def _part_balls(
+        self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float] | None
+    ) -> tuple[Array, Array]:
+        low, high = limits or (0.0, 0.0)
+        roots = [Member(m.joint, m.centers[:1], m.radii[:1], m.outer[:1]) for m in members]
+        points = self._points(roots, top, inner, (low, high), SAMPLES)
+        speeds = np.concatenate([self._speed(m, top, (low, high)) for m in roots])
+        slack = speeds * ((high - low) / (SAMPLES - 1) / 2.0 + LIMIT_SLACK)
+        rows = OF_BIN * np.arange(BINS)[:, None] + np.arange(OF_BIN + 1)
+        within = points[rows]  # (BINS, OF_BIN + 1, bodies, 3)
+        radii, leaves = np.concatenate([m.radii for m in roots]), np.concatenate([m.outer for m in roots])
+        wide = (radii + slack)[:, None]
+        center = 0.5 * ((within - wide).min(axis=(1, 2)) + (within + wide).max(axis=(1, 2)))
+        away = np.linalg.norm(within - center[:, None, None], axis=3).max(axis=1) + slack
+        return np.column_stack([center, (away + radii).max(axis=1) + 1e-9]), (away + leaves).max(axis=1) + 1e-9
+
+    def _points(
+        self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float], count: int
+    ) -> Array:
+        """Return centers of spheres at values of the inner joints, in the frame of the cluster's, (count, n, 3) [m].
+
+        Those that move are kept.
+        """
+        moving, found = (top, tuple(inner), limits, count), list[Array]()
+
+        def poses() -> dict[int, Array]:
+            values, known = np.linspace(*limits, count), {top: np.tile(np.eye(4), (count, 1, 1))}
+            for k in inner:
+                up = product(known[self.joints[k].parent], self.placements[k])
+                known[k] = product(up, _motions(self.joints[k], values))
+            return known
+
+        def placed(joint: int, centers: Array) -> Array:
+            return transformed(self._kept(("poses", *moving), poses)[joint], centers)
+
+        for joint, centers, *_ in members:
+            if joint == top:
+                found.append(np.broadcast_to(centers, (count, *centers.shape)))
+            else:
+                key = "points", *moving, joint, centers.tobytes()
+                found.append(self._kept(key, partial(placed, joint, centers)))
+        return np.ascontiguousarray(np.concatenate(found, axis=1))
+
+    def _speed(self, body: Member, top: int, limits: tuple[float, float]) -> Array:
+        """Bound the speed of a body's spheres relative to the cluster's joint, per unit of the planned joint."""
+        reach = np.linalg.norm(body.centers, axis=1)
+        speed = np.zeros(len(reach))
+        k = body.joint
+        while k != top:
+            joint = self.joints[k]
+            if joint.kind == REVOLUTE:
+                speed += abs(joint.ratio) * reach
+            elif joint.kind == PRISMATIC:
+                speed += abs(joint.ratio)
+                reach = reach + max(abs(joint.ratio * v + joint.shift) for v in limits)
+            reach = reach + np.linalg.norm(self.placements[k][:3, 3])
+            k = joint.parent
+        return speed
 
     def branch(self, joint: int, top: int) -> int:
         """Return the joint below ``top`` that a joint is or hangs at; ``top`` itself, too, where there are many."""
@@ -277,7 +258,7 @@ class JointTree:
         return top if self._below[top] >= MOST_PARTS else chain[max(chain.index(top) - 1, 0)]
 
     def outer_radii(self, centers: Array, body: BodySpec) -> Array:
-        """Return the radii of :func:`apex_ompl.kernel.cluster_balls.leaf_radii`, shape (n,); they are kept."""
+        """Return the radii of :func:`leaf_radii`, shape (n,); they are kept."""
         radii = np.asarray(body.radii, float)
         key = (
             centers.tobytes(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -69,6 +70,9 @@ class _Builder:
         self.number = {b: k for k, b in enumerate(order)}  # body as given -> row
         self.bodies = [bodies[b] for b in order]
         self.cluster_of = [self.clusters.index(keys[b]) for b in order]
+        self.rows_of = [
+            [k for k, c in enumerate(self.cluster_of) if c == cluster] for cluster in range(len(self.clusters))
+        ]
         frames = [product(tree.turns[b.joint].T, b.placement) for b in self.bodies]
         self.centers = [
             transformed(frame, np.asarray(b.centers, float)) for frame, b in zip(frames, self.bodies, strict=True)
@@ -82,6 +86,11 @@ class _Builder:
         ]
         self.part_of = [(self.clusters.index(keys[b]), branches[b]) for b in order]  # cluster and branch of each body
         self.parts = list(dict.fromkeys(self.part_of))
+        seen = Counter[int]()
+        self.bit_of = dict[tuple[int, int], int]()  # of each part among those of its cluster
+        for part in self.parts:
+            self.bit_of[part] = 1 << seen[part[0]]
+            seen[part[0]] += 1
 
     def _key(self, body: BodySpec, number: int) -> tuple[int, int]:
         """Return the key of a body's cluster: the joint, and whether it meets the scene; each fixed body is its own."""
@@ -113,8 +122,8 @@ class _Builder:
             cluster_joint=_ints([j for j, _ in self.clusters]),
             cluster_lazy=_spans([len(ks) for ks in self.lazy]),
             cluster_dof=_ints([self._dof(c) for c in range(len(self.clusters))]),
-            cluster_bodies=_spans([self.cluster_of.count(c) for c in range(len(self.clusters))]),
-            cluster_meets_scene=_ints([bodies[self.cluster_of.index(c)].meets_scene for c in range(len(balls))]),
+            cluster_bodies=_spans([len(rows) for rows in self.rows_of]),
+            cluster_meets_scene=_ints([bodies[rows[0]].meets_scene for rows in self.rows_of]),
             cluster_parts=_spans([sum(c == k for c, _ in self.parts) for k in range(len(self.clusters))]),
             part_lazy=_ints([self._part_joints(*part) for part in self.parts]).reshape(-1, 2),
             part_bodies=_spans([self.part_of.count(part) for part in self.parts]),
@@ -148,7 +157,7 @@ class _Builder:
             inner_ball=np.concatenate([np.empty((0, 4)), *self.inner]),
             pair_ball=np.array([[[*b.center, b.radius] for b in two] for two in pair_balls]).reshape(-1, 2, 4),
             pair_outer=np.array([[b.outer for b in two] for two in pair_balls]).reshape(-1, 2),
-            pair_parts=_ints([self._pair_parts(clusters, rows) for clusters, _, rows in pair_rows]).reshape(-1, 2),
+            pair_parts=_ints([self._pair_parts(rows) for _, _, rows in pair_rows]).reshape(-1, 2),
             run_pairs=pair_runs(_ints([key for key, _, _ in pair_rows]).reshape(-1, 2)),
             **table_arrays([tables.get(row) for row in body_rows], joint_names),
         )
@@ -188,7 +197,7 @@ class _Builder:
             two = []
             for cluster, rows in zip(clusters, zip(*members, strict=True), strict=True):
                 some = frozenset(rows)
-                if not self.lazy[cluster] or len(some) == self.cluster_of.count(cluster):
+                if not self.lazy[cluster] or len(some) == len(self.rows_of[cluster]):
                     two.append(balls[cluster])
                     continue
                 if some not in known:
@@ -197,13 +206,12 @@ class _Builder:
             found.append(two)
         return found
 
-    def _pair_parts(self, clusters: tuple[int, int], members: list[tuple[int, int]]) -> list[int]:
+    def _pair_parts(self, members: list[tuple[int, int]]) -> list[int]:
         """Return the bits of the parts of two clusters that a pair is about."""
-        found = []
-        for cluster, rows in zip(clusters, zip(*members, strict=True), strict=True):
-            parts = [part for part in self.parts if part[0] == cluster]
-            found.append(sum(1 << parts.index(part) for part in {self.part_of[b] for b in rows}))
-        return found
+        return [
+            sum({part: self.bit_of[part] for part in (self.part_of[b] for b in rows)}.values())
+            for rows in zip(*members, strict=True)
+        ]
 
     def _part_joints(self, cluster: int, branch: int) -> tuple[int, int]:
         """Return the first of a part's joints among the lazy ones, and their number."""
@@ -222,9 +230,9 @@ class _Builder:
     def _members(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None) -> list[Member]:
         """Return the bodies of a cluster, or some of them."""
         return [
-            Member(b.joint, self.centers[k], np.asarray(b.radii, float), outer[k])
-            for k, b in enumerate(self.bodies)
-            if self.cluster_of[k] == cluster and (some is None or k in some)
+            Member(self.bodies[k].joint, self.centers[k], np.asarray(self.bodies[k].radii, float), outer[k])
+            for k in self.rows_of[cluster]
+            if some is None or k in some
         ]
 
     def _ball(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None = None) -> ClusterBall:

@@ -3,8 +3,9 @@
 Each cell is planned as a whole, without going back (the nearest goal of each motion is taken, and the cell is lost
 where it does not suit the later steps), without blends, and, as MoveIt's task constructor does it, with OMPL's
 RRTConnect for the motions between the same stages. Times are processor times of one process with a kept
-planner; the first cell of each kind is left out of them, and named beside them. Each run is stored in
-benchmarks/runs/cells when it ends; the command resumes where it was stopped.
+planner; the first cell of each kind is left out of them, and named beside them. What a cell loads stays loaded for the
+rows after the first, so that rows come first by turns. Each run is stored in benchmarks/runs/cells when it ends; the
+command resumes where it was stopped.
 
 Usage: python -m benchmarks.planners.cells [-n 100] [--first 1000] [--timeout 60] [--kind stacking]
 """
@@ -109,8 +110,9 @@ def main() -> None:
     kinds, runs = args.kind or cells.names(), list[dict[str, Any]]()
     FOLDER.mkdir(parents=True, exist_ok=True)
     for seed in range(args.first, args.first + args.n):
+        first = seed % len(ROWS)
         for kind in kinds:
-            for row in ROWS:
+            for row in [*ROWS][first:] + [*ROWS][:first]:
                 file = FOLDER / f"{kind}-{row.replace(' ', '_')}-{seed}.json"
                 if not file.exists():
                     run = made(_planner(kind), kind, row, seed, args.timeout)

@@ -327,6 +327,13 @@ OTHERS: Functions = {
         ROBOT + WORKSPACE + "i8[::1], i8[::1], f8[::1], f8[::1], f8[::1], f8[:, ::1], i8[::1], f8[::1]",
         2,
     ),
+    "robot.tool_poses.close_tools": (
+        ROBOT
+        + WORKSPACE
+        + "i8[::1], i8[::1], f8[::1], i8[:, ::1], f8[:, :, ::1], f8[:, ::1], i8[::1], i8, i8[::1], f8[::1]",
+        3,
+    ),
+    "geometry.enclosing_ball.enclose": ("f8[:, :, ::1], i8[::1], f8[::1], f8[::1], f8[::1]", 1),
     "geometry.bounding_trees.order_items": ("f8[:, :, ::1], f8[::1], f8, i8[:, ::1], i8[::1], f4[:, ::1]", 1),
     "geometry.bounding_trees.fill_boxes": ("f4[:, ::1], i8, f4[:, ::1]", 1),
     "geometry.scene_distance.nearest_of_scenes": (
