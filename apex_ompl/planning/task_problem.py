@@ -50,7 +50,8 @@ def sequence_problem(robot: Robot, problem: Problem, steps: Sequence[Step | Mapp
         ApexError: A step is faulty.
     """
     given = {"name": problem.name, "robot": problem.robot, "start": problem.start, "after": steps_of(robot, steps)}
-    first, *rest = read = validate(Problem, given, "steps").after
+    poses = {name: dict(zip(robot.joint_names, q.tolist(), strict=True)) for name, q in robot.poses.items()}
+    first, *rest = read = validate(Problem, given, "steps", lambda: poses).after
     if not isinstance(first, MoveStep) or first.group is not None or first.blend is not None:
         return problem.model_copy(update={"after": read})
     goal = first.goal.with_joints(problem.start)

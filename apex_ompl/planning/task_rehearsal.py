@@ -18,17 +18,21 @@ from apex_ompl.constraints.line_tracking import LineTracker, Track
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.ompl.setup import state_fault
+from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.query import Group
+from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_goals import TaskGoal, task_goal
 from apex_ompl.planning.task_steps import StepPlanner
-from apex_ompl.planning.task_waypoints import StepFailed
+from apex_ompl.planning.task_waypoints import StepFailed, checked
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
-from apex_ompl.scene.steps import GraspStep, HandedStep, StraightStep, TogetherStep
+from apex_ompl.scene.steps import BodiesStep, DetachStep, GraspStep, HandedStep, StraightStep, TogetherStep
 from apex_ompl.types import Array
+from apex_ompl.util.forking import unforked
 
 BREADTH = 4  # goals of a later stage that are tried from one state
 MOST_VISITS = 48  # goals that are tried in one rehearsal
+UNREACHED = "no free state was found that reaches it"
 FALLBACK = 4, 64  # states and descents for a goal that a few descents do not reach
 
 
@@ -70,6 +74,7 @@ class Rehearsal:
         self.planner, self.stages, self.seed, self.stop = planner, stages(planner.problem), seed, stop
         self._group = group
         self._visits, self._thorough, self._explains = 0, False, True
+        self._reasons = dict[int, str]()  # of stages whose goals no state reaches
 
     def later_goals(self, k: int, world: TaskWorld, q: Array, thorough: bool = False) -> list[Array]:
         """Return goals of the stages after one, all of which can be reached and left by their steps.
@@ -100,9 +105,29 @@ class Rehearsal:
             except StepFailed as failure:
                 failures.append(failure)
                 self._explains = False  # the first failure is the one that is told
-        if not failures:
-            raise StepFailed(f"{move.title}: no free state was found that reaches it")
-        raise failures[0]
+        raise failures[0] if failures else self._unreached(k + 1, world, q).of(move.title)
+
+    def _unreached(self, k: int, world: TaskWorld, q: Array) -> StepFailed:
+        """Return why no state reaches the goal of a stage, as a plan to it would say; it is looked for once."""
+        if k not in self._reasons:
+            move, checker = self.stages[k].move, self.planner.checker
+            made = task_goal(checker.robot, world, self.planner.problem, move, q, group=self._group)
+            self.planner.become(world)
+            with unforked():
+                setup = assemble(
+                    made.problem, checker.robot, seed=self.seed, checker=checker, group=move.group or self._group
+                )
+            self._reasons[k] = query_fault(setup)[1] or UNREACHED
+        return StepFailed(self._reasons[k], UNREACHED)
+
+    def _check(self, world: TaskWorld, q: Array) -> None:
+        """Check that a state, shape (dof,), is free in a world.
+
+        Raises:
+            StepFailed: It is not.
+        """
+        self.planner.become(world)
+        checked(self.planner.checker, full_check(self.planner.checker, q[None]))
 
     def _goals(self, k: int, world: TaskWorld, q: Array) -> Array:
         """Return a few free states that reach the goal of a stage from a state, shape (N, dof)."""
@@ -121,7 +146,7 @@ class Rehearsal:
             try:
                 world, q = self._step(step, world, q)
             except StepFailed as failure:
-                raise StepFailed(f"{step.title}: {failure}", f"{step.title}: {failure.cause}") from None
+                raise failure.of(step.title) from None
         return world, q
 
     def _step(self, step: AnyStep, world: TaskWorld, q: Array) -> tuple[TaskWorld, Array]:
@@ -131,10 +156,12 @@ class Rehearsal:
         if isinstance(step, HandedStep):
             during = world.grasped(step, q) if isinstance(step, GraspStep) else world
             end = self.planner.hand_end(during, step, q)
-            self.planner.become(during)
-            if fault := state_fault(self.planner.checker, end):
-                raise StepFailed(fault)
+            self._check(during, end)
             return world.after(step, end), end
+        if isinstance(step, BodiesStep):
+            after = world.after(step, q)
+            self._check(world if isinstance(step, DetachStep) else after, q)
+            return after, q
         if isinstance(step, TogetherStep):
             ends = [self._step(one, world, q)[1] for one in step.steps]
             end = q + sum((one - q for one in ends), np.zeros(len(q)))

@@ -20,7 +20,7 @@ from apex_ompl.paths.path import Path, abreast
 from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
 from apex_ompl.planning.task_constraints import StepConstraints
-from apex_ompl.planning.task_waypoints import StepFailed, held_pose, waypoints
+from apex_ompl.planning.task_waypoints import LATE, StepFailed, checked, held_pose, waypoints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
@@ -44,7 +44,6 @@ from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
 from apex_ompl.util.clocks import Deadline
 
-LATE = "the time is over"
 BLEND = 0.4  # of the way between two poses of a turn
 HAND_ROOM = 1e-4  # to the limits of a synergy, which motions at another rate need at rests
 DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
@@ -129,7 +128,7 @@ class StepPlanner:
             try:
                 found.append(self._constrained(self.plan(world, step, q, timing)))
             except StepFailed as failure:
-                raise StepFailed(f"{step.title}: {failure}", f"{step.title}: {failure.cause}") from None
+                raise failure.of(step.title) from None
             world, q = found[-1].after, found[-1].end
         return found
 
@@ -230,9 +229,7 @@ class StepPlanner:
         states = plan.path.states
         self.become(plan.world)
         check = full_check(self.checker, states, states[0], [states[-1]], deadline=self._deadline.at)
-        if not check or check.proof is None:
-            raise StepFailed(LATE if check.timed_out else check.reason)
-        plan = replace(plan, clearance=check.proof.clearance)
+        plan = replace(plan, clearance=checked(self.checker, check).clearance)
         return plan if timing is None else self._timed(plan, timing)
 
     def _together(self, world: TaskWorld, step: TogetherStep, q: Array, timing: Timing | None) -> StepPlan:
@@ -251,8 +248,7 @@ class StepPlanner:
         path = Path(abreast([plan.path.states for plan in plans]))
         self.become(during)
         check = full_check(self.checker, path.states if motion is None else motion, deadline=self._deadline.at)
-        if not check or check.proof is None:
-            raise StepFailed(LATE if check.timed_out else check.reason)
+        clearance = checked(self.checker, check).clearance
         lefts, use = [plan.left for plan in plans if not isnan(plan.left)], dict[str, float]()
         for plan in plans:
             use = {name: max(use.get(name, 0.0), share) for name, share in (use | dict(plan.use)).items()}
@@ -260,7 +256,7 @@ class StepPlanner:
             use |= self._kept_together(during, timing, motion)
         left = nan if not lefts else max(lefts) if motion is not None else float(len(path.states) - 1)
         return StepPlan(
-            step, during, after, path, motion, check.proof.clearance, left, use,
+            step, during, after, path, motion, clearance, left, use,
             max(plan.deviation for plan in plans),
         )  # fmt: skip
 

@@ -145,6 +145,7 @@ class TaskPlanner:
         self._times = {"steps": 0.0}
         self.world = TaskWorld.of(checker.robot, problem)
         self.rejected, self.examined = Counter[str](), 0
+        self._reasons = dict[str, str]()  # of each cause, that of the first goal that failed by it
         bodies = self.world.scene.values(), self.world.held.values(), self.world.allowed
         mine = CollisionChecker(checker.robot, *bodies)
         self._steps = StepPlanner(mine, problem, self._deadline, lambda: self._interrupt.pressed)
@@ -208,7 +209,7 @@ class TaskPlanner:
                 try:
                     return self._finished(k, world, found, chosen.later)
                 except StepFailed as failure:
-                    self.rejected[failure.cause] += 1
+                    self._reject(failure)
                     left = [one for one in left if one is not chosen]
                     if not self._search.goes_back:
                         raise
@@ -303,7 +304,7 @@ class TaskPlanner:
                 with self._interruptible():
                     found.append(_Choice(goal, self._rehearsal.later_goals(k, world, goal)))
             except StepFailed as failure:
-                self.rejected[failure.cause] += 1
+                self._reject(failure)
                 failed[alternative] += 1
                 doubtful.append((goal, failure.cause))
                 continue
@@ -320,7 +321,7 @@ class TaskPlanner:
                 with self._interruptible():
                     later = self._rehearsal.later_goals(k, world, goal, thorough=True)
             except StepFailed as failure:
-                self.rejected[failure.cause] += 1
+                self._reject(failure)
                 continue
             yield [_Choice(goal, later)]
 
@@ -337,6 +338,11 @@ class TaskPlanner:
             found = sample(goal, setup.checker, rng, GOAL_STATES, GOAL_ATTEMPTS).states
             yield from made.held_at_start(found)
 
+    def _reject(self, failure: StepFailed) -> None:
+        """Count a failure by its cause, and keep the first reason of each."""
+        self.rejected[failure.cause] += 1
+        self._reasons.setdefault(failure.cause, str(failure))
+
     def _reported(self, result: TaskResult) -> TaskResult:
         """Return a result of the given problem, with the goals that were examined."""
         steps = self._times["steps"]
@@ -350,6 +356,8 @@ class TaskPlanner:
         """Return the result of a task whose steps cannot be done."""
         counts = (+self.rejected).most_common(MOST_CAUSES)
         causes = "; ".join(f"{cause} ({n} of {self.examined} goals)" for cause, n in counts)
+        told = self._reasons.get(counts[0][0], "") if counts else ""
+        causes += f"; the first: {told}" if told not in ("", counts[0][0]) else ""
         robot, status = self._checker.robot, PlanStatus.STEP_FAILED
         if self._deadline.for_search <= 0.0:
             reason, status = f"the task was not planned in {self._options.timeout:g} s", PlanStatus.TIMEOUT

@@ -222,6 +222,11 @@ class GraspGoal(StrictModel):
     remaining: Vector | None = None
 
 
+def _named(value: Any) -> Any:
+    """Return the goal of a pose in place of its name."""
+    return {"joints": value} if isinstance(value, str) else value
+
+
 class Goal(StrictModel):
     """A goal: joint configurations of which one is to be reached, an alignment of held objects, poses, or several.
 
@@ -240,7 +245,7 @@ class Goal(StrictModel):
     alignment: Alignment | None = None
     poses: Annotated[tuple[PoseTarget, ...], Field(min_length=1)] | None = None
     grasp: GraspGoal | None = None
-    any_of: Annotated[tuple[Goal, ...], Field(min_length=1)] | None = None
+    any_of: Annotated[tuple[NamedGoal, ...], Field(min_length=1)] | None = None
     all_of: Annotated[tuple[Goal, ...], Field(min_length=2)] | None = None
 
     @model_validator(mode="after")
@@ -294,6 +299,10 @@ class Goal(StrictModel):
         return self if self.joints is None else Goal(joints=tuple({**values, **given} for given in self.joints))
 
 
+NamedGoal = Annotated[Goal, BeforeValidator(_named, json_schema_input_type=Goal | str)]
+"""A goal; in files the name of a pose of the robot, too."""
+
+
 class MoveStep(MotionStep):
     """A motion to a further goal, by the planner.
 
@@ -303,7 +312,7 @@ class MoveStep(MotionStep):
     """
 
     kind: Literal["move"] = "move"
-    goal: Goal
+    goal: NamedGoal
     group: Names | None = None
 
     @property
@@ -360,7 +369,7 @@ class Problem(StrictModel):
     payload: dict[Name, Mass] = {}
     allowed: tuple[BodyPair, ...] = ()
     start: JointValues
-    goal: Goal
+    goal: NamedGoal
     constraints: tuple[AnyConstraint, ...] = ()
     after: tuple[AnyStep, ...] = ()
 

@@ -15,7 +15,17 @@ import pytest
 from planning import cached_problem
 from tasks import contacts, poses
 
-from apex_ompl import AnyOf, ApexError, MotionPlanner, PlanStatus, PoseTarget, TaskResult, load_robot, plan_task
+from apex_ompl import (
+    AnyOf,
+    ApexError,
+    MotionPlanner,
+    PlanStatus,
+    PoseTarget,
+    TaskResult,
+    load_problem,
+    load_robot,
+    plan_task,
+)
 from apex_ompl.cli.parser import main
 from apex_ompl.goals.grasp_goal import MOST, pose_alternatives
 from apex_ompl.paths.path import abreast
@@ -188,6 +198,57 @@ def test_what_cannot_be_done_is_counted_by_cause() -> None:
         assert sum(result.goals_rejected.values()) == result.goals_examined > 1
 
 
+@pytest.mark.parametrize(
+    "goal, words",
+    [
+        (PoseTarget(frame="hand", position=(500.0, 0.0, 400.0)), "out of reach: hand has to be 640.104 m"),
+        (PoseTarget(frame="hand", position=(500.0, 0.0, 400.0)), "in millimeters it could be reached"),
+        ([0.0, -45.0, 0.0, -135.0, 0.0, 90.0, 45.0], "in degrees it would be inside"),
+        (PoseTarget(frame="hand", position=(0.5, 0.3, 0.4)), "states at the goal collide, "),
+        ({"joints": "home"}, "panda_hand <-> box, "),
+    ],
+)
+def test_later_goals_that_nothing_reaches_are_explained_as_the_first_are(goal: Any, words: str) -> None:
+    with MotionPlanner("panda") as planner:
+        there = planner.fk("home", "hand")[:3, 3].tolist()
+        planner.world.add(name="post", box=(0.2, 0.2, 0.6), position=(0.5, 0.3, 0.4))
+        planner.world.add(name="box", box=(0.1, 0.1, 0.1), position=(*there[:2], there[2] + 0.1))
+        start = dict(zip(planner.robot.joint_names, planner.robot.home.tolist(), strict=True)) | {"panda_joint1": -0.8}
+        result = planner.sequence(start, [{"kind": "wait", "seconds": 0.1}, {"kind": "move", "goal": goal}])
+        assert (
+            not result
+            and words in result.reason
+            and "no free state was found that reaches it (1 of 1 goals)" in result.reason
+        )
+
+
+def test_contacts_of_one_pair_are_one_cause() -> None:
+    with MotionPlanner() as planner:
+        below = PoseTarget(frame="left_hand", position=(0.5, 0.5, -0.06))
+        steps = [{"kind": "remove", "objects": ["table_left"]}, {"kind": "move", "goal": below}]
+        result = planner.sequence("home", [*steps, {"kind": "add", "objects": ["table_left"]}], group="left_arm")
+        assert not result and list(result.goals_rejected) == ["add table_left: collision left_hand_palm table_left"]
+        assert sum(result.goals_rejected.values()) == result.goals_examined
+        assert "left_hand_palm <-> table_left, " in result.reason and " mm deep" in result.reason
+
+
+def test_goals_of_files_are_names_of_poses_too(tmp_path: Path) -> None:
+    file = tmp_path / "home.yaml"
+    file.write_text(
+        "schema: apex-ompl/problem/1\nname: home\nrobot: panda\nstart: home\ngoal: home\n"
+        "after:\n- {kind: move, goal: home}\n- {kind: move, goal: {any_of: [home, {joints: home}]}}\n"
+    )
+    problem = load_problem(str(file))
+    with MotionPlanner("panda") as planner:
+        home = dict(zip(planner.robot.joint_names, planner.robot.home.tolist(), strict=True))
+        assert planner.sequence("home", [{"kind": "move", "goal": {"joints": "home"}}])
+    assert problem.goal.joints == (home,) and [step.goal.joints for step in problem.after[:1]] == [(home,)]
+    assert all(one.joints == (home,) for one in problem.after[1].goal.any_of)
+    file.write_text(file.read_text().replace("goal: home}", "goal: hom}"))
+    with pytest.raises(ApexError, match="after.0.goal.joints.0: unknown pose, did you mean 'home'"):
+        load_problem(str(file))
+
+
 def test_a_link_takes_an_object_and_leaves_it_and_contacts_are_allowed_for_a_time() -> None:
     with MotionPlanner("panda") as planner:
         at = planner.fk("home", "hand")[:3, 3]
@@ -344,7 +405,8 @@ def test_faulty_files_are_refused_in_one_sentence(
     home, wait = {"joints": "home"}, {"kind": "wait", "seconds": 1.0}
     for fields, words in (
         ({"goal": home, "allowed": [["box", "box"]]}, "allowed.0: the body 'box' is not checked against itself"),
-        ({"goal": "home"}, "goal: expected a mapping of keys to values, got 'home'"),
+        ({"goal": "hom"}, "goal.joints.0: unknown pose, did you mean 'home'?, got 'hom'"),
+        ({"goal": 7}, "goal: expected a mapping of keys to values, got 7"),
         ({"goal": {"any_of": []}}, "goal.any_of: expected 1 item or more"),
         ({"after": wait}, "after: expected a list, got"),
         ({"after": [wait, None]}, "after.1: expected a mapping of keys to values, got None"),
