@@ -57,7 +57,10 @@ def whole(
     """
     motions = [plan.motion for plan in plans if plan.motion is not None]
     timed = timing is not None and len(motions) == len(plans)
-    blends = [blend(planner, one, two, timing) if timed else None for one, two in pairwise(plans)]  # type: ignore[arg-type]
+    tried = [blend(planner, *pair, timing) if timing is not None and timed else None for pair in pairwise(plans)]
+    blends = [one if isinstance(one, _Blend) else None for one in tried]
+    rests = zip(plans, tried, strict=False)
+    notes = [f"the robot rests after {plan.step.title}: {why}" for plan, why in rests if isinstance(why, str)]
     starts, ends, clock = list[float](), list[float](), 0.0
     for plan, after in zip(plans, [*blends, None], strict=True):
         starts.append(clock if timed else nan)
@@ -76,7 +79,7 @@ def whole(
             )  # fmt: skip
         clear = [b.clearance for b in (before, after) if b is not None]
         steps.append(replace(one, clearance=min([one.clearance, *clear])))
-    result = replace(TaskResult.of(found), steps=tuple(steps))
+    result = replace(TaskResult.of(found), steps=tuple(steps), notes=(*found.notes, *notes))
     if not timed:
         return result
     motion = _through(motions, starts, [one is not None for one in blends])
@@ -109,23 +112,28 @@ def _through(motions: Sequence[Trajectory], starts: Sequence[float], blended: Se
     return joined(parts)
 
 
-def blend(planner: StepPlanner, first: StepPlan, second: StepPlan, timing: Timing) -> _Blend | None:
-    """Return the longest overlap of two motions that is proved, or None where the robot rests in between.
+def blend(planner: StepPlanner, first: StepPlan, second: StepPlan, timing: Timing) -> _Blend | str | None:
+    """Return the longest overlap of two motions that is proved, why there is none, or None where none is wanted.
 
     The hands stay within the radius of the first step around where they are at its end, all limits are kept, and the
     overlap is free of collision in the world of the second step.
     """
     radius = first.step.blend if isinstance(first.step, MotionStep) else None
-    if radius is None or not isinstance(second.step, MotionStep) or first.motion is None or second.motion is None:
+    if radius is None:
         return None
+    if not isinstance(second.step, MotionStep) or first.motion is None or second.motion is None:
+        return f"{second.step.title} is no motion of the arms"
     same = dict(first.world.scene) == dict(second.world.scene) and dict(first.world.held) == dict(second.world.held)
-    if not same or min(first.motion.duration, second.motion.duration) <= 0.0:
+    if not same:
+        return "other objects are held then"
+    if min(first.motion.duration, second.motion.duration) <= 0.0:
         return None
     world, robot = second.world, planner.robot
     how = timing_in(world, timing)
     scaled = how.limits(robot.limits, robot.joint_names)
     more = how.motion_limits(robot, tuple(world.held.values()), planner.problem.payload)
     planner.become(world)
+    why = "the hand is leaving an object until its end"
     for share in SHARES:
         overlap = share * min(first.motion.duration, second.motion.duration)
         begin = first.motion.duration - overlap
@@ -133,15 +141,19 @@ def blend(planner: StepPlanner, first: StepPlan, second: StepPlan, timing: Timin
             continue
         both = superposed([(first.motion, 0.0), (second.motion, begin)]).before(first.motion.duration).after(begin)
         if _distance(planner.checker, both, first.motion.positions[-1]) > radius:
+            why = f"hands would leave the radius of {radius:g} m"
             continue
         use = both.use(robot.limits) | ({} if more is None else more.use(both))
-        kept = max(both.use(scaled).values()) <= 1.0 + ROUNDING
-        if not kept or (more is not None and max(more.use(both).values(), default=0.0) > 1.0 + ROUNDING):
+        kept = both.use(scaled) | ({} if more is None else more.use(both))
+        if max(kept.values()) > 1.0 + ROUNDING:
+            most = max(kept, key=lambda name: kept[name])
+            why = f"the two motions at once would take {kept[most]:.2f} of the limit of {most}"
             continue
         check = full_check(planner.checker, both)
         if check and check.proof is not None:
             return _Blend(overlap, check.proof.clearance, use)
-    return None
+        why = check.reason
+    return f"in the shortest overlap, {why}"
 
 
 def _distance(checker: CollisionChecker, motion: Trajectory, corner: Array) -> float:

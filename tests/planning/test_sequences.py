@@ -101,6 +101,25 @@ def motion(states: Array) -> Trajectory:
     return time_path(states, robot.limits, robot.joint_names).trajectory
 
 
+@pytest.mark.parametrize(
+    "radius, after, words",
+    [
+        (1e-7, {"kind": "line", "frame": "hand", "by": (0.0, 0.1, 0.0)}, "hands would leave the radius of 1e-07 m"),
+        (0.05, {"kind": "wait", "seconds": 0.1}, "wait 0.1 s is no motion of the arms"),
+        (0.3, {"kind": "move", "goal": "home"}, "of the limit of acceleration"),
+        (0.05, {"kind": "line", "frame": "hand", "by": (0.0, 0.1, 0.0)}, None),
+        (None, {"kind": "line", "frame": "hand", "by": (0.0, 0.1, 0.0)}, None),
+    ],
+)
+def test_a_note_says_why_a_step_is_not_blended(radius: float | None, after: dict[str, Any], words: str | None) -> None:
+    with MotionPlanner("panda") as planner:
+        steps = [{"kind": "line", "frame": "hand", "by": (0.0, 0.0, -0.1), "blend": radius}, after]
+        result = planner.sequence("home", steps)
+    notes = [note for note in result.notes if note.startswith("the robot rests after line hand: ")]
+    assert result and len(notes) == (words is not None) and all(words in note for note in notes if words)
+    assert result.steps[1].blended == (radius is not None and words is None)
+
+
 def test_sums_of_motions_are_the_sums_of_their_displacements() -> None:
     q = load_robot("panda").home
     first = motion(np.stack([q, q + 0.3]))
