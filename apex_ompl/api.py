@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from apex_ompl.moving.replanner import Replanner
     from apex_ompl.moving.settings import LoopSettings
     from apex_ompl.planning.task_result import TaskResult
+    from apex_ompl.planning.tasks import TaskSearch
     from apex_ompl.scene.constraints import Constraint
 
 
@@ -145,8 +146,9 @@ def plan(
 
 
 def plan_task(
-    problem: Problem | str | os.PathLike[str], planner: AnyPlanner | None = None, **options: Unpack[PlanKeywords]
-) -> TaskResult:
+    problem: Problem | str | os.PathLike[str], planner: AnyPlanner | None = None, *, search: TaskSearch | None = None,
+    **options: Unpack[PlanKeywords],
+) -> TaskResult:  # fmt: skip
     """Plan to the goal of a problem and the steps ``after`` it, prove all of it, and join it to one timed motion.
 
     As MoveIt's ``MoveGroup.plan`` goes to a goal and its ``Task.plan`` through all stages, :func:`plan` leaves the
@@ -156,6 +158,7 @@ def plan_task(
     Args:
         problem: A problem, its name, or its file; without steps after the goal the task is the motion to the goal.
         planner: As of :func:`plan`.
+        search: How goals are chosen, and whether steps of several arms may be done at once.
         **options: As of :func:`plan`: ``timeout``, for the whole task, ``seed``, ``simplify``, ``params``,
             ``snapshot``, ``timing``, ``objective``, ``calm_factor``, ``leave_contact``, ``constraints``, which hold up
             to the goal.
@@ -172,7 +175,7 @@ def plan_task(
         planners.chosen(planner, options.get("params"))  # before the problem is read
     loaded = problem if isinstance(problem, Problem) else load_problem(problem)
     with kept_planner(loaded.robot) as kept:
-        return kept.plan_task(loaded, planner, **options)
+        return kept.plan_task(loaded, planner, search=search, **options)
 
 
 def run(

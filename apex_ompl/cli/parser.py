@@ -161,6 +161,10 @@ def _add_plan(commands: Commands[argparse.ArgumentParser], name: str, text: str)
         help="duration of a calm motion as a multiple of the fastest one's (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--no-timing", action="store_true", help="leave the path without times")
+    if name == "sequence":
+        parser.add_argument(
+            "--asynchronous", action="store_true", help="start each arm's steps as soon as what they need is done"
+        )
     parser.add_argument(
         "--timing-method", default="ruckig", metavar="NAME",
         help="of time parameterization: ruckig or spline (default: %(default)s)",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from apex_ompl.api import load_problem, plan, plan_task
@@ -82,7 +83,12 @@ def run(parsed: argparse.Namespace) -> int:
     whole = parsed.command == "sequence"
     if problem.after and not whole:
         print("apex-ompl: note: the steps after the goal are left out; apex-ompl sequence plans them", file=sys.stderr)
-    result = (plan_task if whole else plan)(
+    planned: Callable[..., PlanResult] = plan
+    if whole:
+        from apex_ompl.planning import TaskSearch
+
+        planned = partial(plan_task, search=TaskSearch(asynchronous=parsed.asynchronous))
+    result = planned(
         problem,
         planner=parsed.planner,
         timeout=parsed.timeout,

@@ -200,7 +200,7 @@ class MotionPlanner:
                 ``move`` may be any goal of :meth:`plan` but an object that draws states.
             planner: A planner; see :func:`apex_ompl.plan`.
             name: Name of the problem in the result.
-            search: How goals are chosen.
+            search: How goals are chosen, and whether steps of several arms may be done at once.
             **options: As of :meth:`plan`, ``group`` among them; ``timeout`` is for the whole sequence.
 
         Raises:
@@ -226,7 +226,7 @@ class MotionPlanner:
         Args:
             problem: A problem of this robot.
             planner: A planner; see :func:`apex_ompl.plan`.
-            search: How goals are chosen.
+            search: How goals are chosen, and whether steps of several arms may be done at once.
             **options: As of :meth:`plan`, ``group`` among them; ``timeout`` is for the whole task.
 
         Raises:

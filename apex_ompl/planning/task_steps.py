@@ -104,6 +104,11 @@ class StepPlanner:
         return self._pressed() or self._deadline.expired
 
     @property
+    def ended(self) -> bool:
+        """Whether no time is left."""
+        return self._ends()
+
+    @property
     def robot(self) -> Robot:
         """The robot."""
         return self.checker.robot

@@ -27,6 +27,7 @@ from apex_ompl.planning.query import Group
 from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_goals import TaskGoal, task_goal
 from apex_ompl.planning.task_motion import whole
+from apex_ompl.planning.task_overlaps import shorter, whole_at_once
 from apex_ompl.planning.task_rehearsal import Rehearsal
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner
@@ -65,10 +66,13 @@ class TaskSearch:
         goes_back: Whether the steps after a goal are rehearsed before it is chosen, and other choices tried where a
             step fails. Otherwise the nearest goal of each motion is taken, and the task fails where it does not suit.
         wanted: Goals of the last motion among which the planner chooses.
+        asynchronous: Whether each step starts as soon as the steps that it needs are done, those of its arm and of its
+            objects, while other arms go on. Nothing is blended then.
     """
 
     goes_back: bool = True
     wanted: int = 3
+    asynchronous: bool = False
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -77,6 +81,7 @@ class TaskSearch:
             ParameterError: One is faulty.
         """
         check_flag(self.goes_back, "goes_back")
+        check_flag(self.asynchronous, "asynchronous")
         check_integer(self.wanted, "wanted", 1)
 
 
@@ -173,7 +178,19 @@ class TaskPlanner:
             return self._failed(str(failure))
         assert self._first is not None
         with self._interruptible():
-            return self._reported(whole(self._steps, self._first, plans, self._problem, self._timing))
+            made = whole(self._steps, self._first, plans, self._problem, self._timing)
+            if self._search.asynchronous and made.trajectory is not None:
+                made = self._asynchronous(made, plans)
+        return self._reported(made)
+
+    def _asynchronous(self, made: TaskResult, plans: list[StepPlan]) -> TaskResult:
+        """Return the result with steps of several arms at once, or the given one where that is not shorter."""
+        if self._problem.constraints or self._options.constraints:
+            note = "no steps are done at once, since constraints along the path were proved for one after the other"
+            return replace(made, notes=(*made.notes, note))
+        assert self._first is not None
+        other = whole_at_once(self._steps, self._first, plans, self._problem)
+        return other if other is not None and shorter(other, made) else made
 
     def _ends(self) -> bool:
         return self._interrupt.pressed or self._deadline.for_search <= 0.0

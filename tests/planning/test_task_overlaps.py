@@ -1,0 +1,113 @@
+"""Steps of several arms at once: shorter, free in the worlds of their times by the meshes alone, and in their order."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from apex_ompl import MotionPlanner, PoseTarget, TaskResult
+from apex_ompl.cli.parser import main
+from apex_ompl.collision import CollisionChecker
+from apex_ompl.errors import ParameterError
+from apex_ompl.planning import TaskSearch
+from apex_ompl.planning.task_motion import task_fault
+from apex_ompl.problems import cells
+
+SECONDS = 60.0
+AT_ONCE = TaskSearch(asynchronous=True)
+
+
+@cache
+def made(kind: str, seed: int, asynchronous: bool) -> TaskResult:
+    """The plan of a cell."""
+    cell = cells.draw(kind, seed)
+    with MotionPlanner(cell.robot) as planner:
+        result = planner.plan_task(cell, timeout=SECONDS, seed=seed, search=TaskSearch(asynchronous=asynchronous))
+    assert result, result.reason
+    return result
+
+
+@pytest.mark.parametrize("seed", [2003, 2004, 2005])
+def test_a_handover_is_faster_and_free_by_the_meshes_at_every_time(seed: int) -> None:
+    first, result = made("handover", seed, False), made("handover", seed, True)
+    motion = result.trajectory
+    assert motion is not None and first.trajectory is not None
+    assert motion.duration < 0.95 * first.trajectory.duration and not task_fault(result, motion)
+    assert any("move right_hand" in step.title and " + " in step.title for step in result.steps)
+    with MotionPlanner("dual_panda_softhand") as planner:
+        robot = planner.robot
+    for step, after in zip(result.steps, [*result.steps[1:], None], strict=True):
+        assert after is None or (step.end == after.start and step.end > step.start)
+        meshes = CollisionChecker(robot, step.scene, step.attached, step.allowed, proofs=False)
+        times = np.linspace(step.start, step.end, 2 + int((step.end - step.start) / 0.004))
+        assert meshes.are_free(motion(times)).all(), step.title
+    assert max(motion.use(robot.limits).values()) <= 1.0 + 1e-6
+    assert np.allclose(motion.positions[-1], first.trajectory.positions[-1], atol=1e-9)
+    for name in ("grasped", "released"):  # the same, in the same order
+        assert [getattr(step, name) for step in result.steps if getattr(step, name)] == [
+            getattr(step, name) for step in first.steps if getattr(step, name)
+        ]
+    bar = result.steps[-1].scene[-1]
+    assert bar.name == "bar" and np.allclose(bar.pose, first.steps[-1].scene[-1].pose, atol=1e-9)
+
+
+def test_each_arm_has_the_motions_that_were_planned_at_other_times() -> None:
+    first, result = made("handover", 2003, False), made("handover", 2003, True)
+    assert first.trajectory is not None and result.trajectory is not None
+    for side in ("left", "right"):
+        columns = [k for k, name in enumerate(first.joint_names) if name.startswith(side)]
+        lengths = [
+            np.abs(np.diff(one(np.linspace(0.0, one.duration, 20_000))[:, columns], axis=0)).sum()
+            for one in (first.trajectory, result.trajectory)
+        ]
+        assert np.isclose(lengths[0], lengths[1], rtol=1e-4)
+
+
+def test_two_arms_with_boxes_of_their_own_take_half_of_the_time() -> None:
+    """What is at once is what the steps need: boxes of each side; a wait is for both arms."""
+    steps = list[dict[str, object]]()
+    with MotionPlanner() as planner:
+        for side, y in (("left", 0.45), ("right", -0.45)):
+            planner.world.add(name=f"{side}_box", box=(0.05, 0.05, 0.1), position=(0.6, y, 0.6))
+            over = PoseTarget(frame=f"{side}_hand", position=(0.5, y, 0.5))
+            steps += [
+                {"kind": "move", "goal": over, "group": f"{side}_arm"},
+                {"kind": "attach", "object": f"{side}_box", "link": f"{side}_hand"},
+                {"kind": "line", "frame": f"{side}_hand", "by": (0.0, 0.0, 0.1)},
+                {"kind": "detach", "object": f"{side}_box"},
+                {"kind": "move", "goal": "home", "group": f"{side}_arm"},
+            ]
+        one, both = (planner.sequence("home", steps, search=TaskSearch(asynchronous=a)) for a in (False, True))
+        apart = [*steps[:5], {"kind": "wait", "seconds": 0.2}, *steps[5:]]
+        waiting = planner.sequence("home", apart, search=AT_ONCE)
+    assert one and both and one.trajectory is not None and both.trajectory is not None
+    assert both.trajectory.duration < 0.6 * one.trajectory.duration
+    assert not task_fault(both, both.trajectory)
+    assert {name for step in both.steps for name in step.grasped} <= {"left_box", "right_box"}
+    ends = {body.name: body.position for body in both.steps[-1].scene}
+    assert all(np.allclose(ends[body.name], body.position, atol=1e-6) for body in one.steps[-1].scene)
+    assert waiting and waiting.trajectory is not None
+    assert not any("left" in step.title and "right" in step.title for step in waiting.steps)
+
+
+def test_where_nothing_is_gained_the_steps_stay_one_after_the_other() -> None:
+    first, result = made("pick_and_place", 2000, False), made("pick_and_place", 2000, True)
+    assert first.trajectory is not None and result.trajectory is not None
+    assert np.array_equal(first.trajectory.positions, result.trajectory.positions)
+    assert [step.title for step in first.steps] == [step.title for step in result.steps]
+    with pytest.raises(ParameterError, match="asynchronous"):
+        TaskSearch(asynchronous=1)  # type: ignore[arg-type]
+
+
+def test_steps_at_once_are_planned_from_files_saved_and_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "made.npz"
+    command = ["sequence", "pick_and_hand_over", "--asynchronous", "--timeout", "60", "-o", str(out)]
+    assert main(command) == 0 and " + move right_hand to bar" in capsys.readouterr().out
+    read = TaskResult.load(out)
+    assert read.trajectory is not None and not task_fault(read, read.trajectory)
+    assert [step.kind for step in read.steps].count("at once") >= 1
