@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,6 +18,7 @@ from apex_ompl.physics.result import UNPLANNED, TaskRun
 from apex_ompl.physics.trials import Spread, draw, nominal
 from apex_ompl.planning.planner import MotionPlanner
 from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.constraints import Upright
 from apex_ompl.scene.problem import Problem
@@ -136,20 +138,28 @@ class TaskRunner:
         return tuple(Upright(frame=name, axis=axes[name], angle=SPILLING) for name in full)
 
 
-def execute(plan: TaskResult, settings: TwinSettings = GRASPING) -> TaskRun:
-    """Execute a planned task or sequence in physics, from the start and with the objects that it was planned for.
+def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
+    """Execute a plan in physics, from the start and with the objects that it was planned for.
 
     Objects that a hand holds at the start are welded to it.
 
     Args:
-        plan: The plan, with a motion.
+        plan: A planned task or sequence, or the plan of one motion, such as that of a schedule; with a motion.
         settings: Settings of the model.
 
     Raises:
-        ParameterError: The plan has no motion, or fingers do not yield.
+        ParameterError: It is no result of a plan, or has no motion, or an obstacle moves, or fingers do not yield.
     """
+    if not isinstance(plan, PlanResult):
+        given = plan if plan is None or isinstance(plan, str | os.PathLike) else type(plan)
+        raise ParameterError(
+            "plan", given, "the result of plan, plan_task, sequence or schedule, or one that was loaded"
+        )
     if not plan or plan.trajectory is None:
-        raise ParameterError("plan", f"{plan.status}", "a task that was planned and timed")
+        what = f"{plan.status} without a motion" if plan else f"{plan.status}, {plan.reason}"
+        raise ParameterError("plan", what, "a result that was planned and timed")
+    if not isinstance(plan, TaskResult) or not plan.steps:
+        plan = TaskResult.of_motion(plan)
     runner = TaskRunner(plan.problem, settings=settings)
     trial = nominal(runner.robot, plan.problem, settings.density)
     executor = Executor(runner.robot, trial, friction=(), settings=settings)
