@@ -183,8 +183,9 @@ class Executor:
             if isinstance(one, AttachStep):
                 self.grasps.attach(one.object, taking_link(self.robot, one))
             if isinstance(one, DetachStep):
-                rest = {hand for name in held for hand in hands_of(self.robot, held[name]) if name != one.object}
-                hands = [hand for hand in hands_of(self.robot, held[one.object]) if hand not in rest]
+                others = [k for k in planned.attached if k.name != one.object and k.touch_links != ()]
+                busy = {hand for other in others for hand in hands_of(self.robot, other)}
+                hands = [hand for hand in hands_of(self.robot, held[one.object]) if hand not in busy]
                 self.grasps.detach(one.object, hands, self._to)
         self._steps.append((planned.title, round(begin, 4), round(driver.time, 4)))
 

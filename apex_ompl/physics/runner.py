@@ -25,6 +25,7 @@ from apex_ompl.scene.problem import Problem
 from apex_ompl.util.validation import check_integer, check_name, check_positive
 
 TIMEOUT = 30.0  # of planning [s]
+AT_REST = 1e-3  # largest velocity at the start of what is executed [rad/s]
 PLANS, SEEDS = 4, 10**6  # most plans of a task, and the distance of their seeds
 SPILLING = 1.45  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
 
@@ -148,16 +149,20 @@ def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
         settings: Settings of the model.
 
     Raises:
-        ParameterError: It is no result of a plan, or has no motion, or an obstacle moves, or fingers do not yield.
+        ParameterError: It is no result of a plan, or has no motion that starts at rest, or an obstacle moves, or
+            fingers do not yield.
     """
     if not isinstance(plan, PlanResult):
-        given = plan if plan is None or isinstance(plan, str | os.PathLike) else type(plan)
         raise ParameterError(
-            "plan", given, "the result of plan, plan_task, sequence or schedule, or one that was loaded"
+            "plan", _named(plan), "what plan, plan_task or sequence returns, .result of a schedule, or a loaded result"
         )
     if not plan or plan.trajectory is None:
         what = f"{plan.status} without a motion" if plan else f"{plan.status}, {plan.reason}"
         raise ParameterError("plan", what, "a result that was planned and timed")
+    fastest = int(np.argmax(np.abs(plan.trajectory.velocities[0])))
+    if (speed := abs(float(plan.trajectory.velocities[0, fastest]))) > AT_REST:
+        what = f"{plan.trajectory.joint_names[fastest]} at {speed:.3g} rad/s"
+        raise ParameterError("plan", what, "a motion that starts at rest")
     if not isinstance(plan, TaskResult) or not plan.steps:
         plan = TaskResult.of_motion(plan)
     runner = TaskRunner(plan.problem, settings=settings)
@@ -165,6 +170,11 @@ def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
     executor = Executor(runner.robot, trial, friction=(), settings=settings)
     executor.grasp()
     return executor.run(plan)
+
+
+def _named(given: object) -> object:
+    """Return a value, or its type where its text is long."""
+    return given if given is None or isinstance(given, str | os.PathLike) else type(given)
 
 
 def unplanned(problem: Problem, seed: int | None, reason: str, outcome: str = UNPLANNED) -> TaskRun:
