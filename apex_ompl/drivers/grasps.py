@@ -137,13 +137,14 @@ class Grasps:
         self._standing.discard(name)
 
     def detach(
-        self, name: str, hands: Collection[str], advance: Callable[[float], None] | None = None
+        self, name: str, links: Collection[str], hands: Collection[str], advance: Callable[[float], None] | None = None
     ) -> None:  # fmt: skip
-        """Let an object go where it is, from all links, and take the pressure from hands that hold it.
+        """Let an object go where it is, from links, and take the pressure from hands.
 
         Args:
             name: The object.
-            hands: Names of these hands.
+            links: Names of the links.
+            hands: Names of the hands.
             advance: As of :meth:`grasp`.
         """
         advance = advance or self.driver.advance
@@ -151,8 +152,7 @@ class Grasps:
             self.open(hand)
         if hands:
             advance(self.driver.time + OPENING)
-        self._cut([name], self.driver.robot.link_names, advance)
-        self._standing.add(name)
+        self._cut([name], links, advance)
 
     def _cut(self, names: Collection[str], links: Collection[str], advance: Callable[[float], None]) -> None:
         """Cut the welds of objects to links, after they have yielded."""
@@ -222,6 +222,15 @@ class _Guide:
 def hands_of(robot: Robot, held: AttachedObject) -> tuple[str, ...]:
     """Return the names of the hands that hold an object."""
     return tuple(name for name, hand in robot.hands.items() if set(held.holders) & set(robot.hand_of(hand.palm)))
+
+
+def holder_of(robot: Robot, held: AttachedObject) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the hand that a step ``detach`` frees an object from, if any, and the links of it, or the only link."""
+    for name, hand in robot.hands.items():
+        links = robot.hand_of(hand.palm)
+        if held.link in links:
+            return (name,), links
+    return (), (held.link,)
 
 
 def in_link(driver: MujocoDriver, name: str, link: str) -> Array:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, in_link, turned
+from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, holder_of, in_link, turned
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.twin_settings import TwinSettings, taking_link
 from apex_ompl.drivers.vessels import filled
@@ -31,7 +31,6 @@ from apex_ompl.scene.steps import (
     ReleaseStep,
     RemoveStep,
     Step,
-    TakingStep,
     parts,
 )
 from apex_ompl.timing.trajectory import Trajectory
@@ -185,8 +184,8 @@ class Executor:
             if isinstance(one, DetachStep):
                 others = [k for k in planned.attached if k.name != one.object and k.touch_links != ()]
                 busy = {hand for other in others for hand in hands_of(self.robot, other)}
-                hands = [hand for hand in hands_of(self.robot, held[one.object]) if hand not in busy]
-                self.grasps.detach(one.object, hands, self._to)
+                own, links = holder_of(self.robot, held[one.object])
+                self.grasps.detach(one.object, links, [hand for hand in own if hand not in busy], self._to)
         self._steps.append((planned.title, round(begin, 4), round(driver.time, 4)))
 
     def _stood(self) -> dict[str, tuple[str, Array]]:
@@ -295,14 +294,10 @@ def intended(robot: Robot, plan: TaskResult) -> Mapping[str, Intended]:
         for name in planned.released:
             one = next(held for held in planned.attached if held.name == name)
             pose = robot.link_pose(end, one.link) @ one.pose
-            others = [link for link in one.holders if link not in links and name not in detached]
+            own = holder_of(robot, one)[1] if name in detached else links
+            others = [link for link in one.holders if link not in own]
             if others:
                 found[name] = Intended(name, others[0], np.linalg.inv(robot.link_pose(end, others[0])) @ pose)
             else:
                 found[name] = Intended(name, "", pose, name in planned.gone)
-        standing = {body.name: body for body in planned.scene}
-        for taking in parts([step]):
-            if isinstance(taking, TakingStep) and taking.object in standing:
-                link, pose = taking_link(robot, taking), standing[taking.object].pose
-                found[taking.object] = Intended(taking.object, link, np.linalg.inv(robot.link_pose(end, link)) @ pose)
     return found

@@ -22,10 +22,10 @@ from apex_ompl.physics.execution import GRAVITY, STEEPEST, intended, motion_of
 from apex_ompl.planning import ArmStep, schedule
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.problems import cells
-from apex_ompl.robot import Robot, load_robot
+from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import WaitStep
+from apex_ompl.scene.steps import DetachStep, WaitStep
 
 library()
 SECONDS = 120.0
@@ -264,12 +264,11 @@ def test_what_may_touch_stands_and_what_is_attached_is_carried(take: str, let_go
     assert not run.grasps or take == "grasp"
 
 
-def test_what_a_last_step_attaches_is_to_be_held() -> None:
-    plan = carried("attach", "", "world")
-    first = plan.steps[:4]
-    assert first[-1].kind == "attach"
-    short = replace(plan, problem=plan.problem.model_copy(update={"after": plan.problem.after[:3]}), steps=first)
-    assert intended(load_robot("panda"), short)["box"].link == "panda_hand"
+def test_what_both_hands_hold_is_detached_from_one() -> None:
+    after = (DetachStep(object="tray"), WaitStep(seconds=0.2))
+    plan = plan_task(cached_problem("carry_tray").model_copy(update={"after": after}), timeout=SECONDS)
+    run = execute(plan)
+    assert run and "tray is held by right_hand" in [check.name for check in run.checks], run.reason
 
 
 def test_plans_of_one_motion_are_executed(tmp_path: Path) -> None:
