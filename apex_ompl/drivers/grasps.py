@@ -4,6 +4,7 @@ The synergy of a hand is commanded beyond the first contact with an object; its 
 torque of the synergy is limited. While a hand closes on an object that no other one holds, a weld without weight guides
 it. An object that two links of a hand press on may then be welded to its palm; the weld yields a little, as fingers do.
 Grippers with jaws close on what stands somewhere without any help, and hold it by friction alone.
+What a step attaches to a link is welded to it, where it is.
 An object that two hands hold at once, as the ends of a tray, is welded to both palms, whether they touch it or not, and
 one that a link without a hand holds to that link.
 """
@@ -16,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.drivers.jaws import RIGID
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.twin_settings import TwinSettings
 from apex_ompl.robot.model import Robot
@@ -122,13 +124,45 @@ class Grasps:
 
         Welds yield before they are cut, so that an object that touches something is not thrown off.
         """
-        driver, model, palm = self.driver, self.driver.twin.model, self._palm(hand)
-        (advance or driver.advance)(driver.time + OPENING)
-        welds = [model.equality(f"{name} {palm}").id for name in names if self._objects[name].touch_links != ()]
+        robot, advance = self.driver.robot, advance or self.driver.advance
+        advance(self.driver.time + OPENING)
+        self._cut(names, robot.hand_of(self._palm(hand)), advance)
+
+    def attach(self, name: str, link: str) -> None:
+        """Weld an object to a link, where it is."""
+        twin = self.driver.twin
+        twin.weld(self.driver.data, name, link)
+        weld = twin.model.equality(f"{name} {link}").id
+        twin.model.eq_solref[weld], twin.model.eq_solimp[weld] = RIGID["solref"], RIGID["solimp"]
+        self._standing.discard(name)
+
+    def detach(
+        self, name: str, links: Collection[str], hands: Collection[str], advance: Callable[[float], None] | None = None
+    ) -> None:  # fmt: skip
+        """Let an object go where it is, from links, and take the pressure from hands.
+
+        Args:
+            name: The object.
+            links: Names of the links.
+            hands: Names of the hands.
+            advance: As of :meth:`grasp`.
+        """
+        advance = advance or self.driver.advance
+        for hand in hands:
+            self.open(hand)
+        if hands:
+            advance(self.driver.time + OPENING)
+        self._cut([name], links, advance)
+
+    def _cut(self, names: Collection[str], links: Collection[str], advance: Callable[[float], None]) -> None:
+        """Cut the welds of objects to links, after they have yielded."""
+        driver, model = self.driver, self.driver.twin.model
+        known = ((name, link) for name in names for link in driver.twin.welded_to(self._objects[name]))
+        welds = [model.equality(f"{name} {link}").id for name, link in known if link in links]
         stiff = model.eq_solref[welds].copy(), model.eq_solimp[welds].copy()
         for weld in welds:
             model.eq_solref[weld], model.eq_solimp[weld, :2] = SOFT
-        (advance or driver.advance)(driver.time + SOFTENING)
+        advance(driver.time + SOFTENING)
         for weld in welds:
             driver.data.eq_active[weld] = False
         model.eq_solref[welds], model.eq_solimp[welds] = stiff
@@ -188,6 +222,15 @@ class _Guide:
 def hands_of(robot: Robot, held: AttachedObject) -> tuple[str, ...]:
     """Return the names of the hands that hold an object."""
     return tuple(name for name, hand in robot.hands.items() if set(held.holders) & set(robot.hand_of(hand.palm)))
+
+
+def holder_of(robot: Robot, held: AttachedObject) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the hand that a step ``detach`` frees an object from, if any, and the links of it, or the only link."""
+    for name, hand in robot.hands.items():
+        links = robot.hand_of(hand.palm)
+        if held.link in links:
+            return (name,), links
+    return (), (held.link,)
 
 
 def in_link(driver: MujocoDriver, name: str, link: str) -> Array:

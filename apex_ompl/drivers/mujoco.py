@@ -8,6 +8,7 @@ MuJoCo compensates. Its integrator has velocities half a step before positions; 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -108,6 +109,7 @@ class MujocoDriver:
         self.twin = twin = Twin(robot, problem, settings)
         self.data = twin.data(finite_array(state, "state"))
         loads = twin.loads if assumed is None else held_loads(robot, assumed, twin.settings)
+        self.allow(() if problem is None else problem.allowed)
         self._loaded, self._bare = Dynamics(robot, loads), Dynamics(robot)
         self._rotors, self._friction = twin.rotor_inertia, twin.friction
         self._pressed, self._press = np.zeros(len(self.names)), np.zeros(len(self.names))
@@ -211,7 +213,7 @@ class MujocoDriver:
         """Pairs of bodies that touched since the start, by name, and how deep at most [m].
 
         Pairs that may touch are left out: those that the robot's checker does not check, held objects and the links
-        that may touch them, and those that the problem allows. The floor is ``world``.
+        that may touch them, and those that are allowed then (:meth:`allow`). The floor is ``world``.
         """
         return dict(self._contacts)
 
@@ -224,6 +226,13 @@ class MujocoDriver:
     def torque_use(self) -> Array:
         """Torques at the links at each step as shares of their limits, shape (N, dof)."""
         return self.execution.torque_use
+
+    def allow(self, pairs: Iterable[tuple[str, str]]) -> None:
+        """Let only these pairs be allowed from now on: :attr:`contacts` leaves them out, and they touch nevertheless.
+
+        At first these are the pairs that the problem allows.
+        """
+        self._allowed = {(min(pair), max(pair)) for pair in pairs}
 
     def forget(self) -> None:
         """Forget what happened so far: contacts and :attr:`execution`."""
@@ -306,7 +315,8 @@ class MujocoDriver:
             twin.step(data)
             row[:, 3] = twin.asked_torques(data)
             for pair, depth in twin.contacts(data).items():
-                self._contacts[pair] = max(depth, self._contacts.get(pair, 0.0))
+                if pair not in self._allowed:
+                    self._contacts[pair] = max(depth, self._contacts.get(pair, 0.0))
         self._times.append(times)
         self._parts.append(rows)
         self._steps += len(times)

@@ -1,7 +1,9 @@
 """A model in MuJoCo of a robot with its fixtures, the obstacles of a problem, and the objects that it holds.
 
 Kinematics, masses and inertias of the links are those of the URDF, and geometry that of the collision checker. Pairs of
-links that the checker does not check do not collide. Joints that mimic others follow them by equality constraints. The
+links that the checker does not check do not collide. Bodies that a problem allows to touch do touch here; a pair whose
+shapes overlap at the start would be pushed apart, and passes through. Joints that mimic others follow them by equality
+constraints. The
 motors of the planned joints are driven by torque, and compensate the gravity of the links. The effort of
 a robot file limits the torque at the link, as the limits of a Panda do, whose sensors are behind the gears: what the
 rotor and the friction of a joint need at its limits of acceleration and velocity, its motor gives in addition. Held
@@ -12,7 +14,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import combinations, count
 from typing import Any
 
@@ -36,6 +38,7 @@ from apex_ompl.drivers.twin_settings import (
     mimic_joints,
     payloads,
     servo_gains,
+    taking_link,
     with_mass,
 )
 from apex_ompl.errors import RobotError
@@ -44,6 +47,7 @@ from apex_ompl.robot.model import Robot, link_of
 from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, place_at
+from apex_ompl.scene.steps import AttachStep, parts
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_name
 
@@ -52,6 +56,7 @@ FINGER_DAMPING = 0.01  # of the springs by which fingers yield [Nm s/rad]
 SOFT_CONTACT = {"solref": [0.004, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
 SOLIDS, FALLING = 1, 2  # bits by which geoms collide: the floor is touched by held objects only
 GONE = 8  # by how much these bits are shifted of bodies that are gone
+OVERLAP = 0.005  # of a pair that may touch, at the start, from which on it passes through each other [m]
 AWAY = np.array([0.0, 0.0, -1000.0])  # where obstacles are that have not appeared [m]
 COLORS = {
     "link": (0.85, 0.86, 0.88, 1.0), "fixture": (0.79, 0.65, 0.49, 1.0), "obstacle": (0.78, 0.33, 0.24, 1.0),
@@ -96,8 +101,8 @@ class Twin:
         self.held: tuple[AttachedObject, ...] = problem.attached if problem else ()
         self.moving: tuple[Obstacle, ...] = tuple(one for one in scene if one.moving)
         self.loads = held_loads(robot, problem, self.settings) if problem else ()
-        self.model = self._compiled(scene)
-        model = self.model
+        spec = self._spec(scene)
+        self.model = model = self._compiled(spec)
         joints = [model.joint(name) for name in robot.joint_names]
         self.q = np.array([joint.qposadr[0] for joint in joints])
         self.v = np.array([joint.dofadr[0] for joint in joints])
@@ -112,6 +117,9 @@ class Twin:
         limited = model.jnt_actfrclimited[[joint.id for joint in joints]].astype(bool)
         self.motor_torque = np.where(limited, model.jnt_actfrcrange[[joint.id for joint in joints], 1], np.inf)
         self._compensated = model.jnt_actgravcomp[[joint.id for joint in joints]].astype(float)
+        if overlapping := self._overlapping():
+            _exclude(spec, overlapping)
+            self.model = self._compiled(spec)
 
     @property
     def yields(self) -> bool:
@@ -121,12 +129,16 @@ class Twin:
     def welded_to(self, held: AttachedObject) -> tuple[str, ...]:
         """Return the links that an object can be welded to: its holder, and where fingers yield any palm.
 
-        An object that no link may touch stands on another one there, and is not welded.
+        To these come the links that steps of the problem attach it to. An object that no link may touch stands on
+        another one where fingers yield, and is not welded.
         """
         if not self.yields:
             return (held.link,)
         palms = [hand.palm for hand in self.robot.hands.values()]
-        return () if held.touch_links == () else tuple(dict.fromkeys((held.link, *palms)))
+        steps = parts(self.problem.after) if self.problem else ()
+        taking = [one for one in steps if isinstance(one, AttachStep) and one.object == held.name]
+        links = (held.link, *palms, *(taking_link(self.robot, one) for one in taking))
+        return () if held.touch_links == () else tuple(dict.fromkeys(links))
 
     def weld(self, data: Any, name: str, link: str, active: bool = True) -> None:
         """Weld a held object to a link where it is now, or cut that weld.
@@ -252,7 +264,7 @@ class Twin:
     def contacts(self, data: Any) -> dict[tuple[str, str], float]:
         """Return the pairs of bodies that touch by their names, and how deep [m]; the floor is ``world``.
 
-        Pairs that may touch are left out.
+        Those that the problem allows are among them.
         """
         if not data.ncon:
             return {}
@@ -267,11 +279,12 @@ class Twin:
         at = self.model.joint(name).qposadr[0]
         data.qpos[at : at + 3], data.qpos[at + 3 : at + 7] = pose[:3, 3], _quaternion(pose)
 
-    def _compiled(self, scene: Sequence[Obstacle]) -> Any:
+    def _spec(self, scene: Sequence[Obstacle]) -> Any:
+        """Return the model before it is compiled."""
         spec = self._skeleton()
         self._add_links(spec)
         self._add_joints(spec)
-        coupled = add_jaws(self._mj, spec, self.robot) if self.yields else 0
+        self._coupled = add_jaws(self._mj, spec, self.robot) if self.yields else 0
         for fixture in self.robot.fixtures:
             self._add_static(spec, fixture, "fixture")
         for obstacle in scene:
@@ -282,13 +295,16 @@ class Twin:
             self._add_payload(spec, load)
         self._add_exclusions(spec)
         self._add_surroundings(spec)
+        return spec
+
+    def _compiled(self, spec: Any) -> Any:
         try:
             model = spec.compile()
         except ValueError as error:
             reason = " ".join(str(error).split())
             raise RobotError(f"MuJoCo cannot make a model of {self.robot.name} ({reason})") from error
         joints = int(np.sum(model.eq_type == self._mj.mjtEq.mjEQ_JOINT)) + model.ntendon
-        if joints - coupled != len(self.mimics):
+        if joints - self._coupled != len(self.mimics):
             raise RobotError(f"MuJoCo has {joints} equalities for the {len(self.mimics)} mimic joints of the URDF")
         return model
 
@@ -419,7 +435,10 @@ class Twin:
                 spec.add_mesh(name=geom.meshname, uservert=shape.vertices.ravel())
 
     def _add_exclusions(self, spec: Any) -> None:
-        """Exclude the pairs that the checker does not check: of the robot, of held objects, and of the problem."""
+        """Exclude the pairs that the checker does not check: of the robot and of held objects.
+
+        Of those that the problem allows these are pairs of links, whose shapes are wider than the links at joints.
+        """
         robot, model = self.robot, self.robot.model
         items = list(robot.geometry.geometryObjects)
         links = [link_of(model, item) for item in items]
@@ -433,9 +452,19 @@ class Twin:
         for one, other in combinations(self.held, 2):
             if not self.yields and _joint_of(robot, one.link) == _joint_of(robot, other.link):
                 pairs.add(frozenset((one.name, other.name)))
-        pairs |= {frozenset(pair) for pair in (self.problem.allowed if self.problem else ()) if len(set(pair)) == 2}
-        for first, second in sorted(sorted(pair) for pair in pairs):
-            spec.add_exclude(bodyname1=first, bodyname2=second)
+        _exclude(spec, pairs | {pair for pair in self._allowed() if pair <= set(robot.link_names)})
+
+    def _allowed(self) -> set[frozenset[str]]:
+        """Return the pairs that the problem allows to touch."""
+        return {frozenset(pair) for pair in (self.problem.allowed if self.problem else ()) if len(set(pair)) == 2}
+
+    def _overlapping(self) -> set[frozenset[str]]:
+        """Return the pairs that may touch and overlap at the start of the problem."""
+        allowed = self._allowed()
+        if self.problem is None or not allowed:
+            return set()
+        touching = self.contacts(self.data(self.problem.start_state(self.robot.joint_names)))
+        return allowed & {frozenset(pair) for pair, depth in touching.items() if depth > OVERLAP}
 
     def _add_surroundings(self, spec: Any) -> None:
         """Add the floor, light and background."""
@@ -450,6 +479,11 @@ class Twin:
         sky = spec.add_texture(name="sky", type=mj.mjtTexture.mjTEXTURE_SKYBOX, width=64, height=64)
         sky.builtin, sky.rgb1, sky.rgb2 = mj.mjtBuiltin.mjBUILTIN_GRADIENT, COLORS["floor"][:3], COLORS["floor"][:3]
         spec.visual.quality.numslices, spec.visual.quality.numstacks = 64, 32
+
+
+def _exclude(spec: Any, pairs: Iterable[frozenset[str]]) -> None:
+    for first, second in sorted(sorted(pair) for pair in pairs):
+        spec.add_exclude(bodyname1=first, bodyname2=second)
 
 
 def _joint_of(robot: Robot, link: str) -> int:

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, in_link, turned
+from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, holder_of, in_link, turned
 from apex_ompl.drivers.mujoco import MujocoDriver
-from apex_ompl.drivers.twin_settings import TwinSettings
+from apex_ompl.drivers.twin_settings import TwinSettings, taking_link
 from apex_ompl.drivers.vessels import filled
 from apex_ompl.physics.judges import Check, Intended, Judge
 from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun
@@ -23,7 +23,16 @@ from apex_ompl.planning.task_result import TaskResult, TaskStep
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import AddStep, GraspStep, ReleaseStep, RemoveStep, Step, TogetherStep
+from apex_ompl.scene.steps import (
+    AddStep,
+    AttachStep,
+    DetachStep,
+    GraspStep,
+    ReleaseStep,
+    RemoveStep,
+    Step,
+    parts,
+)
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
 
@@ -153,8 +162,8 @@ class Executor:
 
     def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:
         driver, begin = self.driver, self.driver.time
-        parts = step.steps if isinstance(step, TogetherStep) else (step,)
-        for one in parts:
+        driver.allow(planned.allowed)
+        for one in parts([step]):
             if isinstance(one, ReleaseStep):
                 self.grasps.open(one.hand)
             for name in one.objects if isinstance(one, RemoveStep | AddStep) else ():
@@ -163,13 +172,20 @@ class Executor:
             driver.send(motion, max(driver.time, driver.end))
             self._to(driver.end)
         held = {one.name: one for one in planned.attached}
-        for one in parts:
+        for one in parts([step]):
             if isinstance(one, ReleaseStep):
                 links = self.robot.hand_of(self.robot.hands[one.hand].palm)
                 mine = [name for name in planned.released if set(held[name].holders) & set(links)]
                 self.grasps.release(mine, one.hand, self._to)
             if isinstance(one, GraspStep):
                 self.grasps.grasp(one.object, one.hand, self._to)
+            if isinstance(one, AttachStep):
+                self.grasps.attach(one.object, taking_link(self.robot, one))
+            if isinstance(one, DetachStep):
+                others = [k for k in planned.attached if k.name != one.object and k.touch_links != ()]
+                busy = {hand for other in others for hand in hands_of(self.robot, other)}
+                own, links = holder_of(self.robot, held[one.object])
+                self.grasps.detach(one.object, links, [hand for hand in own if hand not in busy], self._to)
         self._steps.append((planned.title, round(begin, 4), round(driver.time, 4)))
 
     def _stood(self) -> dict[str, tuple[str, Array]]:
@@ -272,13 +288,14 @@ def intended(robot: Robot, plan: TaskResult) -> Mapping[str, Intended]:
     for planned, step in zip(plan.steps, (None, *plan.problem.after), strict=True):
         for held in planned.attached:
             found[held.name] = Intended(held.name, held.link, held.pose)
-        parts = step.steps if isinstance(step, TogetherStep) else (step,)
-        hands = [one.hand for one in parts if isinstance(one, ReleaseStep)]
+        hands = [one.hand for one in parts([step]) if isinstance(one, ReleaseStep)]
         links, end = {k for hand in hands for k in robot.hand_of(robot.hands[hand].palm)}, planned.path.states[-1]
-        for name in planned.released if hands else ():
+        detached = {one.object for one in parts([step]) if isinstance(one, DetachStep)}
+        for name in planned.released:
             one = next(held for held in planned.attached if held.name == name)
             pose = robot.link_pose(end, one.link) @ one.pose
-            others = [link for link in one.holders if link not in links]
+            own = holder_of(robot, one)[1] if name in detached else links
+            others = [link for link in one.holders if link not in own]
             if others:
                 found[name] = Intended(name, others[0], np.linalg.inv(robot.link_pose(end, others[0])) @ pose)
             else:

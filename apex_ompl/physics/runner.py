@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,12 +18,14 @@ from apex_ompl.physics.result import UNPLANNED, TaskRun
 from apex_ompl.physics.trials import Spread, draw, nominal
 from apex_ompl.planning.planner import MotionPlanner
 from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.constraints import Upright
 from apex_ompl.scene.problem import Problem
 from apex_ompl.util.validation import check_integer, check_name, check_positive
 
 TIMEOUT = 30.0  # of planning [s]
+AT_REST = 1e-3  # largest velocity at the start of what is executed [rad/s]
 PLANS, SEEDS = 4, 10**6  # most plans of a task, and the distance of their seeds
 SPILLING = 1.45  # angle from upright up to which a vessel is tilted on the way to a goal [rad]
 
@@ -136,25 +139,42 @@ class TaskRunner:
         return tuple(Upright(frame=name, axis=axes[name], angle=SPILLING) for name in full)
 
 
-def execute(plan: TaskResult, settings: TwinSettings = GRASPING) -> TaskRun:
-    """Execute a planned task or sequence in physics, from the start and with the objects that it was planned for.
+def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
+    """Execute a plan in physics, from the start and with the objects that it was planned for.
 
     Objects that a hand holds at the start are welded to it.
 
     Args:
-        plan: The plan, with a motion.
+        plan: A planned task or sequence, or the plan of one motion, such as that of a schedule; with a motion.
         settings: Settings of the model.
 
     Raises:
-        ParameterError: The plan has no motion, or fingers do not yield.
+        ParameterError: It is no result of a plan, or has no motion that starts at rest, or an obstacle moves, or
+            fingers do not yield.
     """
+    if not isinstance(plan, PlanResult):
+        raise ParameterError(
+            "plan", _named(plan), "what plan, plan_task or sequence returns, .result of a schedule, or a loaded result"
+        )
     if not plan or plan.trajectory is None:
-        raise ParameterError("plan", f"{plan.status}", "a task that was planned and timed")
+        what = f"{plan.status} without a motion" if plan else f"{plan.status}, {plan.reason}"
+        raise ParameterError("plan", what, "a result that was planned and timed")
+    fastest = int(np.argmax(np.abs(plan.trajectory.velocities[0])))
+    if (speed := abs(float(plan.trajectory.velocities[0, fastest]))) > AT_REST:
+        what = f"{plan.trajectory.joint_names[fastest]} at {speed:.3g} rad/s"
+        raise ParameterError("plan", what, "a motion that starts at rest")
+    if not isinstance(plan, TaskResult) or not plan.steps:
+        plan = TaskResult.of_motion(plan)
     runner = TaskRunner(plan.problem, settings=settings)
     trial = nominal(runner.robot, plan.problem, settings.density)
     executor = Executor(runner.robot, trial, friction=(), settings=settings)
     executor.grasp()
     return executor.run(plan)
+
+
+def _named(given: object) -> object:
+    """Return a value, or its type where its text is long."""
+    return given if given is None or isinstance(given, str | os.PathLike) else type(given)
 
 
 def unplanned(problem: Problem, seed: int | None, reason: str, outcome: str = UNPLANNED) -> TaskRun:

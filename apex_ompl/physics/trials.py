@@ -18,7 +18,7 @@ from apex_ompl.drivers.vessels import liquid
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import MOTION, AttachedObject, Obstacle, given_fields, pose_fields
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import TakingStep, TogetherStep
+from apex_ompl.scene.steps import TakingStep, parts
 from apex_ompl.types import Array
 from apex_ompl.util.validation import check_number
 
@@ -121,8 +121,7 @@ def draw(robot: Robot, problem: Problem, seed: int | None, spread: Spread, densi
 
 def grasped_later(problem: Problem) -> tuple[Obstacle, ...]:
     """Return the obstacles that steps of a problem take."""
-    steps = [one for step in problem.after for one in (step.steps if isinstance(step, TogetherStep) else (step,))]
-    names = {step.object for step in steps if isinstance(step, TakingStep)}
+    names = {step.object for step in parts(problem.after) if isinstance(step, TakingStep)}
     return tuple(one for one in problem.scene if one.name in names)
 
 

@@ -164,6 +164,18 @@ class TaskResult(PlanResult):
         """Return the result of a plan to a goal as that of a task without steps."""
         return cls(**{one.name: getattr(result, one.name) for one in fields(PlanResult)})
 
+    @classmethod
+    def of_motion(cls, result: PlanResult) -> TaskResult:
+        """Return the result of a plan with a motion as a task of one step; steps after its goal are left out."""
+        problem, motion = result.problem, result.trajectory
+        assert motion is not None
+        bodies = problem.scene, problem.attached, problem.allowed
+        step = TaskStep(
+            GOAL, GOAL, float(motion.times[0]), float(motion.times[-1]), Path(motion.positions),
+            result.motion_clearance, *bodies,
+        )  # fmt: skip
+        return replace(cls.of(result), problem=problem.model_copy(update={"after": ()}), steps=(step,))
+
     @property
     def goal_time(self) -> float:
         """Time at which the goal is reached [s]; NaN without a motion."""

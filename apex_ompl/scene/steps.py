@@ -7,6 +7,7 @@ further goals are defined beside these, in :mod:`apex_ompl.scene.problem`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
@@ -373,3 +374,11 @@ class TogetherStep(Step):
     def subject(self) -> str:
         """The steps."""
         return f"({', '.join(step.title for step in self.steps)})"
+
+
+def parts(steps: Iterable[Step | None]) -> tuple[Step, ...]:
+    """Return steps with those that happen together one by one; None is left out."""
+    found = list[Step]()
+    for step in steps:
+        found += step.steps if isinstance(step, TogetherStep) else () if step is None else (step,)
+    return tuple(found)

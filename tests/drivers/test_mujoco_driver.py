@@ -161,6 +161,24 @@ def test_a_moving_obstacle_is_where_its_script_says_and_is_touched(robot: Robot)
     assert any("crossing" in pair for pair in driver.contacts)
 
 
+def test_allowed_contacts_are_felt_and_left_out(robot: Robot) -> None:
+    motion, pair = lifted(robot), ("left_hand_palm", "wall")
+    palm = robot.link_pose(motion.positions[-1], "left_hand_palm")[:3, 3]
+    wall = Obstacle(name="wall", box=(0.1, 0.1, 0.1), position=tuple(palm))
+    found, then = [], []
+    for allowed in ((), (pair,), (pair,)):
+        driver = MujocoDriver(robot, at_home(robot, wall, allowed=allowed))
+        if found[1:]:
+            driver.allow(())
+        driver.send(motion, 0.0)
+        driver.advance(motion.duration)
+        found.append(driver.contacts)
+        then.append(driver.state().positions)
+    assert pair in found[0] and found[2] == found[0]
+    assert found[1] == {key: depth for key, depth in found[0].items() if key != pair}
+    assert np.array_equal(then[0], then[1])
+
+
 def test_motions_beyond_the_torque_limits_are_clipped(robot: Robot) -> None:
     """With 2 kg in each hand, timed with and without limits of torque."""
     loads, goal = {"left_hand": 2.0, "right_hand": 2.0}, robot.home.copy()

@@ -195,7 +195,7 @@ def test_contacts_of_held_objects_are_the_verdicts_of_the_checker(robot: Robot, 
     assert wrong == 0 and 5 < colliding < 55
 
 
-def test_an_allowed_pair_does_not_collide(robot: Robot) -> None:
+def test_an_allowed_pair_that_overlaps_at_the_start_does_not_collide(robot: Robot) -> None:
     palm = robot.link_pose(robot.home, "left_hand_palm")
     wall = Obstacle(name="wall", box=(0.1, 0.1, 0.1), position=tuple(palm[:3, 3]))
     twin = Twin(robot, problem_of(robot, (wall,)))
@@ -204,6 +204,14 @@ def test_an_allowed_pair_does_not_collide(robot: Robot) -> None:
     allowed = Twin(robot, problem_of(robot, (wall,), allowed=(("wall", "left_hand_palm"),)))
     found = {pair for pair in allowed.contacts(allowed.data(robot.home)) if "wall" in pair}
     assert found == touching - {("left_hand_palm", "wall")}
+
+
+def test_an_allowed_pair_that_is_apart_at_the_start_collides(robot: Robot) -> None:
+    there = robot.home.copy()
+    there[0] += 0.8
+    wall = Obstacle(name="wall", box=(0.1, 0.1, 0.1), position=tuple(robot.link_pose(there, "left_hand_palm")[:3, 3]))
+    twin = Twin(robot, problem_of(robot, (wall,), allowed=(("wall", "left_hand_palm"),)))
+    assert ("left_hand_palm", "wall") in twin.contacts(twin.data(there))
 
 
 def test_any_robot_has_a_twin(tmp_path: Path) -> None:

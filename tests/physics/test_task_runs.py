@@ -13,17 +13,19 @@ import pytest
 from physics import library
 from planning import cached_problem
 
-from apex_ompl import MotionPlanner, plan_task
+from apex_ompl import MotionPlanner, PlanResult, PoseTarget, plan_task
 from apex_ompl.cli import main
 from apex_ompl.drivers import TwinSettings
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.physics import Spread, TaskRun, TaskRunner, execute, execution
 from apex_ompl.physics.execution import GRAVITY, STEEPEST, intended, motion_of
+from apex_ompl.planning import ArmStep, schedule
+from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.problems import cells
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import WaitStep
+from apex_ompl.scene.steps import DetachStep, WaitStep
 
 library()
 SECONDS = 120.0
@@ -216,6 +218,84 @@ def test_what_a_step_removes_is_gone_in_physics_until_it_is_added() -> None:
     blind = replace(plan, problem=plan.problem.model_copy(update={"after": (WaitStep(seconds=1.0),) * 4}))
     hit = execute(blind)
     assert {"door"} <= {name for pair in hit.contacts for name in pair}
+
+
+def carried(take: str, let_go: str, allowed: str) -> TaskResult:
+    """A box that stands on a table, which it may touch, is taken to another place there."""
+    turns = ((1, 0, 0, 0), (0, 1, 0, 0))
+    steps: dict[str, Any] = {
+        "grasp": {"kind": "grasp", "hand": "hand", "object": "box"}, "release": {"kind": "release", "hand": "hand"},
+        "attach": {"kind": "attach", "object": "box", "link": "panda_hand"},
+        "detach": {"kind": "detach", "object": "box"},
+        "step": {"kind": "allow", "pairs": [("box", "table")]}, "world": {"kind": "wait", "seconds": 0.1},
+        "": {"kind": "wait", "seconds": 0.1},
+    }  # fmt: skip
+    place = PoseTarget(frame="box", position=(0.5, 0.2, 0.0502), orientation=(0, 0, 0, 1), free_turn="z")
+    with MotionPlanner("panda") as planner:
+        world = planner.world
+        world.add(name="table", box=(0.8, 1.2, 0.02), position=(0.6, 0, -0.01))
+        world.add(
+            name="box", box=(0.05, 0.05, 0.1), position=(0.5, -0.2, 0.05),
+            grasps=[{"position": (0, 0, 0.03), "orientation": turn} for turn in turns],
+        )  # fmt: skip
+        if allowed == "world":
+            world.allow("box", "table")
+        return planner.sequence("home", [
+            {"kind": "move", "goal": {"grasp": {"object": "box", "hand": "hand", "approach": (0, 0, 0.1)}}},
+            steps[allowed], steps[take], {"kind": "line", "frame": "hand", "by": (0, 0, 0.1)},
+            {"kind": "move", "goal": place}, steps[let_go],
+            *([{"kind": "retreat", "hand": "hand", "distance": 0.1}] if let_go else []),
+        ], timeout=SECONDS)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("take", "let_go", "allowed"),
+    [
+        ("grasp", "release", "world"), ("attach", "detach", "step"), ("attach", "release", "world"),
+        ("attach", "", "world"), ("grasp", "detach", "step"),
+    ],
+)  # fmt: skip
+def test_what_may_touch_stands_and_what_is_attached_is_carried(take: str, let_go: str, allowed: str) -> None:
+    run = execute(carried(take, let_go, allowed))
+    assert run and not run.contacts, run.reason
+    assert ("box is where it was put" if let_go else "box is held by hand") in [check.name for check in run.checks]
+    assert np.linalg.norm(run.poses["box"][-1, :3] - (0.5, 0.2, 0.05)) < 0.01
+    assert run.poses["box"][:, 2].max() > 0.1
+    assert not run.grasps or take == "grasp"
+
+
+def test_what_both_hands_hold_is_detached_from_one() -> None:
+    after = (DetachStep(object="tray"), WaitStep(seconds=0.2))
+    plan = plan_task(cached_problem("carry_tray").model_copy(update={"after": after}), timeout=SECONDS)
+    run = execute(plan)
+    assert run and "tray is held by right_hand" in [check.name for check in run.checks], run.reason
+
+
+def test_plans_of_one_motion_are_executed(tmp_path: Path) -> None:
+    with MotionPlanner() as planner:
+        there = PoseTarget(frame="right_hand", position=(0.5, 0.0, 0.45))
+        plan = planner.plan("home", there, group="right_arm", timeout=SECONDS)
+        whole = schedule(planner, "home", [ArmStep("reach", "right_arm", there)], timeout=SECONDS)
+        whole.result.save(tmp_path / "schedule.npz")
+        untimed = planner.plan("home", there, group="right_arm", timing=False)
+        failed = planner.plan("home", PoseTarget(frame="right_hand", position=(5.0, 0.0, 0.4)), timeout=1.0)
+    loaded = PlanResult.load(tmp_path / "schedule.npz")
+    for one in (plan, loaded):
+        run = execute(one)
+        assert run and [title for title, _, _ in run.steps] == ["goal"], run.reason
+        assert one.trajectory is not None and not run.contacts
+        np.testing.assert_allclose(run.measured[-1], one.trajectory.positions[-1], atol=1e-3)
+    motion = loaded.trajectory
+    assert motion is not None
+    moving = replace(loaded, trajectory=motion.after(0.5 * motion.duration))
+    bad: list[tuple[Any, str]] = [
+        (None, "got None"), ("x.npz", "got 'x.npz'"), (whole, "Schedule'"), (motion, "Trajectory'"),
+        (untimed, "planned and timed, got 'EXACT_SOLUTION without"), (failed, "got 'INVALID_GOAL, right_hand is out"),
+        (moving, "at rest"),
+    ]  # fmt: skip
+    for given, match in bad:
+        with pytest.raises(ParameterError, match=f"plan: expected .*{match}"):
+            execute(given)
 
 
 def test_a_plan_is_executed_as_it_is() -> None:
