@@ -17,7 +17,7 @@ from apex_ompl.physics.execution import Executor, motion_of, rehearsed
 from apex_ompl.physics.result import UNPLANNED, TaskRun
 from apex_ompl.physics.trials import Spread, draw, nominal
 from apex_ompl.planning.planner import MotionPlanner
-from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.planning.task_result import AT_ONCE, TaskResult
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.constraints import Upright
@@ -150,7 +150,7 @@ def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
 
     Raises:
         ParameterError: It is no result of a plan, or has no motion that starts at rest, or an obstacle moves, or
-            fingers do not yield.
+            steps are done at once, since hands wait until they hold, or fingers do not yield.
     """
     if not isinstance(plan, PlanResult):
         raise ParameterError(
@@ -165,6 +165,8 @@ def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
         raise ParameterError("plan", what, "a motion that starts at rest")
     if not isinstance(plan, TaskResult) or not plan.steps:
         plan = TaskResult.of_motion(plan)
+    if any(step.kind == AT_ONCE for step in plan.steps):
+        raise ParameterError("plan", "steps of several arms at once", "steps one after the other, without asynchronous")
     runner = TaskRunner(plan.problem, settings=settings)
     trial = nominal(runner.robot, plan.problem, settings.density)
     executor = Executor(runner.robot, trial, friction=(), settings=settings)

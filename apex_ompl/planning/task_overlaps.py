@@ -19,7 +19,7 @@ from apex_ompl.constraints.links import Links
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.task_motion import changes
-from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
+from apex_ompl.planning.task_result import AT_ONCE, GOAL, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner
 from apex_ompl.planning.task_waypoints import LATE, StepFailed
 from apex_ompl.planning.task_world import TaskWorld
@@ -28,6 +28,7 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.steps import (
     AttachStep,
+    DetachStep,
     SceneStep,
     TakingStep,
     TogetherStep,
@@ -36,7 +37,6 @@ from apex_ompl.scene.steps import (
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.combination import superposed
 
-AT_ONCE = "at once"  # kind of what several arms do
 SAME = 1e-9  # time between events that are one [s]
 PARTS = 8  # of the time between the earliest start of a step and the last, at whose ends it is tried
 
@@ -249,13 +249,16 @@ def _needs(robot: Robot, plan: StepPlan) -> frozenset[str] | None:
     parts = step.steps if isinstance(step, TogetherStep) else (step,)
     if any(isinstance(one, WaitStep | SceneStep) for one in parts):
         return None
+    detached = {plan.world.holder(one.object) for one in parts if isinstance(one, DetachStep)}
+    if None in detached:
+        return None
     links, hands = Links.of(robot), set[str]()
     for name, hand in robot.hands.items():
         joints = {*links.moved(links.point(hand.palm, np.zeros(3)).joint)}
         if hand.synergy is not None:
             joints.add(robot.joint_names.index(hand.synergy))
         named = any(name in (getattr(one, "hand", None), getattr(one, "link", None)) for one in parts)
-        if joints & moved or named:
+        if joints & moved or named or name in detached:
             hands.add(name)
     if not hands or any(isinstance(one, AttachStep) and one.link not in robot.hands for one in parts):
         return None

@@ -22,6 +22,7 @@ from apex_ompl.util.schema import StrictModel, read_json, read_yaml, validate
 from apex_ompl.util.validation import finite_array
 
 GOAL = "goal"
+AT_ONCE = "at once"  # kind of what several arms do
 """Kind of the first step, the motion to the goal."""
 
 
@@ -39,7 +40,8 @@ class TaskStep:
     """One step of a task that was planned.
 
     Attributes:
-        kind: ``goal`` for the motion to the goal, else the kind of the step in the problem.
+        kind: ``goal`` for the motion to the goal, ``at once`` for what several arms do, else the kind of the step in the
+            problem.
         title: The kind and what it is about, in one line.
         start: Time at which it starts [s]; NaN without a motion.
         end: Time at which it ends, at rest [s].

@@ -37,6 +37,7 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ((0,), "info"),
     ((0,), "schema"),
     ((0,), "check own.yaml"),
+    ((0,), "sequence pick_and_hand_over --asynchronous --timeout 30"),
     *(
         ((0,), f"{command} {rest}")
         for command in ("plan", "sequence")

@@ -12,6 +12,7 @@ from apex_ompl import MotionPlanner, PoseTarget, TaskResult
 from apex_ompl.cli.parser import main
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
+from apex_ompl.physics import execute
 from apex_ompl.planning import TaskSearch
 from apex_ompl.planning.task_motion import task_fault
 from apex_ompl.problems import cells
@@ -106,8 +107,10 @@ def test_steps_at_once_are_planned_from_files_saved_and_read(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "made.npz"
-    command = ["sequence", "pick_and_hand_over", "--asynchronous", "--timeout", "60", "-o", str(out)]
+    command = ["sequence", "pick_and_hand_over", "--asynchronous", "--timeout", "60", "--out", str(out)]
     assert main(command) == 0 and " + move right_hand to bar" in capsys.readouterr().out
     read = TaskResult.load(out)
     assert read.trajectory is not None and not task_fault(read, read.trajectory)
     assert [step.kind for step in read.steps].count("at once") >= 1
+    with pytest.raises(ParameterError, match="expected steps one after the other, without asynchronous"):
+        execute(read)
