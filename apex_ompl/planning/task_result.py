@@ -40,8 +40,8 @@ class TaskStep:
     """One step of a task that was planned.
 
     Attributes:
-        kind: ``goal`` for the motion to the goal, ``at once`` for what several arms do, else the kind of the step in the
-            problem.
+        kind: ``goal`` for the motion to the goal, ``at once`` where several arms do something, else the kind of the
+            step in the problem.
         title: The kind and what it is about, in one line.
         start: Time at which it starts [s]; NaN without a motion.
         end: Time at which it ends, at rest [s].
