@@ -54,7 +54,9 @@ class TaskGoal:
         if self.goal is None:
             return next((one for one in self.states if np.abs(one - q).max() <= NEAR), None)
         for member in self.goal.members if isinstance(self.goal, AnyGoal) else (self.goal,):
-            end: Array = member.inverse.descend(q, tolerance=TOLERANCE).states[0]
+            near = self.start.copy()  # joints that move none of the frames stay
+            near[member.inverse.free] = q[member.inverse.free]
+            end: Array = member.inverse.descend(near, tolerance=TOLERANCE).states[0]
             if np.abs(end - q).max() <= NEAR and within(member.errors(end), member.bounds):
                 kept: Array = self.held_at_start(end[None])[0]
                 return kept

@@ -36,6 +36,7 @@ from apex_ompl.scene.steps import (
 )
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.combination import superposed
+from apex_ompl.types import Array
 
 SAME = 1e-9  # time between events that are one [s]
 PARTS = 8  # of the time between the earliest start of a step and the last, at whose ends it is tried
@@ -243,6 +244,31 @@ def _changed(
     return world
 
 
+def joints_of_hands(robot: Robot) -> dict[str, set[int]]:
+    """Return the numbers of the planned joints of each hand: those that move its palm, and its own."""
+    links, found = Links.of(robot), dict[str, set[int]]()
+    for name, hand in robot.hands.items():
+        found[name] = {*links.moved(links.point(hand.palm, np.zeros(3)).joint)}
+        if hand.synergy is not None:
+            found[name].add(robot.joint_names.index(hand.synergy))
+    return found
+
+
+def joints_needed(robot: Robot, start: Array, goals: Sequence[Array]) -> list[str] | None:
+    """Return names of the joints of the hands that move from a start to goals, or None where all joints are needed.
+
+    Args:
+        robot: The robot.
+        start: The start, shape (dof,).
+        goals: The goals, shape (dof,) each.
+    """
+    moved = set(np.flatnonzero((np.array(goals) != start).any(axis=0)).tolist())
+    joints = set[int]().union(*(mine for mine in joints_of_hands(robot).values() if mine & moved))
+    if not moved or not moved <= joints or len(joints) == robot.dof:
+        return None
+    return [robot.joint_names[k] for k in sorted(joints)]
+
+
 def _needs(robot: Robot, plan: StepPlan) -> frozenset[str] | None:
     """Return the hands and objects that a step needs for itself, or None where it needs all."""
     step, moved = plan.step, set(np.flatnonzero((plan.path.states != plan.path.states[0]).any(axis=0)).tolist())
@@ -252,11 +278,8 @@ def _needs(robot: Robot, plan: StepPlan) -> frozenset[str] | None:
     detached = {plan.world.holder(one.object) for one in parts if isinstance(one, DetachStep)}
     if None in detached:
         return None
-    links, hands = Links.of(robot), set[str]()
-    for name, hand in robot.hands.items():
-        joints = {*links.moved(links.point(hand.palm, np.zeros(3)).joint)}
-        if hand.synergy is not None:
-            joints.add(robot.joint_names.index(hand.synergy))
+    hands = set[str]()
+    for name, joints in joints_of_hands(robot).items():
         named = any(name in (getattr(one, "hand", None), getattr(one, "link", None)) for one in parts)
         if joints & moved or named or name in detached:
             hands.add(name)

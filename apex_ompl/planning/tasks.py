@@ -27,7 +27,7 @@ from apex_ompl.planning.query import Group
 from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_goals import TaskGoal, task_goal
 from apex_ompl.planning.task_motion import whole
-from apex_ompl.planning.task_overlaps import shorter, whole_at_once
+from apex_ompl.planning.task_overlaps import joints_needed, shorter, whole_at_once
 from apex_ompl.planning.task_rehearsal import Rehearsal
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner
@@ -67,7 +67,7 @@ class TaskSearch:
             step fails. Otherwise the nearest goal of each motion is taken, and the task fails where it does not suit.
         wanted: Goals of the last motion among which the planner chooses.
         asynchronous: Whether each step starts as soon as the steps that it needs are done, those of its arm and of its
-            objects, while other arms go on. Nothing is blended then.
+            objects, while other arms go on; motions move no arm that need not. Nothing is blended then.
     """
 
     goes_back: bool = True
@@ -264,7 +264,11 @@ class TaskPlanner:
         states = tuple(dict(zip(names, goal.tolist(), strict=True)) for goal in goals)
         problem = problem.model_copy(update={"goal": Goal(joints=states), "after": ()})
         self._checker.become(world.scene, world.held, world.pairs)
-        return self._plan_to(problem, time, k == 0, move.group or self._options.group)
+        group, others = move.group or self._options.group, None
+        if group is None and self._search.asynchronous:
+            others = joints_needed(self._checker.robot, q, goals)
+        found = self._plan_to(problem, time, k == 0, group or others)
+        return found if found or others is None or self._ends() else self._plan_to(problem, time, k == 0, None)
 
     def _choices(
         self, k: int, world: TaskWorld, q: Array, later: list[Array], setup: PlanningSetup | None

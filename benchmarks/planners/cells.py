@@ -1,11 +1,11 @@
 """Sequences in random cells: pick and place with 50 grasps, a handover, and three boxes stacked with both hands.
 
 Each cell is planned as a whole, without going back (the nearest goal of each motion is taken, and the cell is lost
-where it does not suit the later steps), without blends, and, as MoveIt's task constructor does it, with OMPL's
-RRTConnect for the motions between the same stages. Times are processor times of one process with a kept
-planner; the first cell of each kind is left out of them, and named beside them. What a cell loads stays loaded for the
-rows after the first, so that rows come first by turns. Each run is stored in benchmarks/runs/cells when it ends; the
-command resumes where it was stopped.
+where it does not suit the later steps), without blends, as MoveIt does it, with OMPL's RRTConnect for
+the motions between the same stages, and with steps of both arms at once. Times are processor times of one process with
+a kept planner; the first cell of each kind is left out of them, and named beside them. What a cell loads stays loaded
+for the rows after the first, so that rows come first by turns. Each run is stored in benchmarks/runs/cells when it
+ends; the command resumes where it was stopped.
 
 Usage: python -m benchmarks.planners.cells [-n 100] [--first 1000] [--timeout 60] [--kind stacking]
 """
@@ -35,7 +35,7 @@ FOLDER = record.RESULTS.parent / "runs" / "cells"
 RIVAL = "rrtconnect+polish"
 ROWS = {
     "sequence": TaskSearch(), "without going back": TaskSearch(goes_back=False), "without blends": TaskSearch(),
-    RIVAL: TaskSearch(),
+    RIVAL: TaskSearch(), "asynchronous": TaskSearch(asynchronous=True),
 }  # fmt: skip
 COMPARED = "sequence", "without blends"  # by their makespans
 MOST_CAUSES = 4  # that a table names

@@ -67,6 +67,17 @@ def test_each_arm_has_the_motions_that_were_planned_at_other_times() -> None:
         assert np.isclose(lengths[0], lengths[1], rtol=1e-4)
 
 
+def test_an_arm_brings_a_box_while_the_other_one_puts_its_own_down() -> None:
+    first, result = made("stacking", 2001, False), made("stacking", 2001, True)
+    motion = result.trajectory
+    assert motion is not None and first.trajectory is not None and not task_fault(result, motion)
+    assert motion.duration < 0.95 * first.trajectory.duration
+    alone = [step for step in result.steps if step.title == "line left_hand"]
+    right = [k for k, name in enumerate(result.joint_names) if name.startswith("right")]
+    assert alone and all(np.ptp(step.path.states[:, right], axis=0).max() == 0.0 for step in alone)
+    assert any("b" in step.title.split() and "left_hand" in step.title for step in result.steps if " + " in step.title)
+
+
 def test_two_arms_with_boxes_of_their_own_take_half_of_the_time() -> None:
     """What is at once is what the steps need: boxes of each side; a wait is for both arms."""
     steps = list[dict[str, object]]()
