@@ -116,9 +116,13 @@ class SceneBodies:
         """Return an obstacle, which is not a fixture of the robot's.
 
         Raises:
-            SceneError: There is no such obstacle.
+            SceneError: There is no such obstacle, or it is a fixture of the robot.
         """
         found = self._obstacles.get(name) if isinstance(name, str) else None
+        if found is not None and name in self._fixtures:
+            what = "it is a fixture of the robot, where it stays"
+            instead = "world.allow lets bodies touch it, and a step 'remove' of a sequence takes it away"
+            raise SceneError(f"no obstacle {name!r}; {what}: {instead}")
         if not isinstance(found, Obstacle):
             raise SceneError(f"no obstacle {name!r}; there are: {', '.join(self.obstacles) or 'none'}")
         return found
