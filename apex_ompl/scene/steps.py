@@ -203,6 +203,8 @@ class ReleaseStep(Step):
 class GraspStep(Step):
     """A hand closes on an obstacle, or on an object that another hand holds, and holds it.
 
+    An object that is farther away than the hand is long is not taken.
+
     Attributes:
         hand: Name of the hand.
         object: The object.

@@ -336,6 +336,14 @@ def test_faulty_steps_are_named(step: Any, words: str) -> None:
         assert words in str(raised.value)
 
 
+@pytest.mark.parametrize(("x", "away"), [(0.62, ""), (1.5, "far is about 1.0 m away from left_hand")])
+def test_an_object_far_from_a_hand_is_not_grasped(x: float, away: str) -> None:
+    with MotionPlanner() as planner:
+        planner.world.add(name="far", box=(0.05, 0.05, 0.05), position=(x, 0.3, 0.5))
+        result = planner.sequence("home", [{"kind": "grasp", "hand": "left_hand", "object": "far"}])
+    assert bool(result) == (not away) and away in result.reason
+
+
 @pytest.mark.parametrize("kind", ["sequence", "plan"])
 def test_faulty_files_are_refused_in_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str
