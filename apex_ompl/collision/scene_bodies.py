@@ -7,10 +7,10 @@ from types import MappingProxyType
 from typing import Any
 
 from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.shapes import coal_geometry, extent_in_link, mesh_note, with_file_read, world_geometry
+from apex_ompl.collision.shapes import body_note, coal_geometry, extent_in_link, with_file_read, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid, size_note
+from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line, progress
@@ -152,7 +152,7 @@ class SceneBodies:
         obstacle = with_file_read(obstacle)
         self.meshes.add(obstacle.name, *world_geometry(obstacle))
         self._put(obstacle)
-        if note := mesh_note(obstacle) or size_note(obstacle):
+        if note := body_note(obstacle):
             self._notes[obstacle.name] = note
         self._obstacles_changed()
 
@@ -237,7 +237,7 @@ class SceneBodies:
         self.meshes.attach(held, geometry, held.pose)
         self._attached[held.name] = held
         self._extents[held.name] = held.link, extent_in_link(geometry, held.pose)
-        if note := mesh_note(held):
+        if note := body_note(held):
             self._notes[held.name] = note
         self._held_changed()
 
