@@ -33,6 +33,7 @@ from apex_ompl.planning.task_problem import with_lines
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene import OnPlane
 from apex_ompl.scene.constraints import PoseTolerance
+from apex_ompl.scene.problem import Goal
 
 
 def hand_pose(robot: Robot, q: np.ndarray, hand: str = "left_hand") -> pin.SE3:
@@ -209,6 +210,22 @@ def test_goals_that_all_fail_say_so_in_a_sentence(robot: Robot) -> None:
     assert refused.status is PlanStatus.INVALID_GOAL and refused.reason.startswith("none found in ")
 
 
+def test_goals_are_mappings_as_in_files_too(robot: Robot) -> None:
+    place = tuple(hand_pose(robot, robot.home).translation.tolist())
+    grasp, grasps = {"object": "box", "hand": "left_hand"}, [{"position": (0, 0, 0), "orientation": (0, 0, 0, 1)}]
+    with MotionPlanner(robot) as planner:
+        planner.world.add(name="box", box=(0.02, 0.02, 0.02), position=place, grasps=grasps)
+        for mapping, same in (
+            ({"grasp": grasp}, Goal(grasp=grasp)),
+            ({"poses": [{"frame": "left_hand", "position": place}]}, PoseTarget(frame="left_hand", position=place)),
+            ({"joints": "home"}, "home"),
+            ({"joints": ["home", robot.home]}, ["home", dict(zip(robot.joint_names, robot.home, strict=True))]),
+            ({"any_of": [{"grasp": grasp}, "home"]}, AnyOf([Goal(grasp=grasp), "home"])),
+            (AnyOf([{"grasp": grasp}, {"joints": "home"}]), AnyOf([Goal(grasp=grasp), "home"])),
+        ):
+            assert planner.problem("home", mapping).goal == planner.problem("home", same).goal
+
+
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
@@ -219,6 +236,11 @@ def test_goals_that_all_fail_say_so_in_a_sentence(robot: Robot) -> None:
         (lambda: AnyOf([PoseTarget(frame="hnd", position=(0.5, 0.0, 0.5))]), "unknown frame of a pose 'hnd'"),
         (lambda: AnyOf(["hme"]), "unknown pose"),
         (lambda: AnyOf([[1.0, 2.0]]), "goal: expected a state of shape"),
+        (lambda: {"grasp": {"object": "box"}}, "goal: grasp.hand: required key is missing"),
+        (lambda: {"grasp": {"object": "box", "hand": "left_hand"}}, "object"),
+        (lambda: {"grasp": {}, "left_joint1": 0.1}, "unknown key"),
+        (lambda: {"joints": {"left_joint1": 0.1}}, "joint .* is missing"),
+        (lambda: [{"grasp": {"object": "box", "hand": "left_hand"}}, "home"], "AnyOf of both"),
         (lambda: {"left_joint1": 0.1}, "joint .* is missing"),
         (lambda: AnyOf([{"left_joint1": 0.1}]), "joint .* is missing"),
     ],
