@@ -38,7 +38,7 @@ from apex_ompl.scene.bodies import (
     pose_matrix,
 )
 from apex_ompl.scene.constraints import AngleTolerance, AnyConstraint, PoseTolerance, is_turn
-from apex_ompl.scene.steps import MotionStep, Names, SceneStep, SimultaneousStep, TogetherStep
+from apex_ompl.scene.steps import Approach, MotionStep, Names, SceneStep, SimultaneousStep, TogetherStep
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
@@ -165,7 +165,7 @@ class PoseTarget(StrictModel):
     turn: tuple[float, float] | None = None
     lower: Vector = (0.0, 0.0, 0.0)
     upper: Vector = (0.0, 0.0, 0.0)
-    approach: Vector | None = None
+    approach: Approach | None = None
 
     @model_validator(mode="after")
     def _a_region(self) -> Self:
@@ -176,8 +176,8 @@ class PoseTarget(StrictModel):
             raise ValueError(f"expected turn: {wanted}{degrees_hint(self.turn, is_turn)}")
         if not all(low <= 0.0 <= high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError("expected a lower of 0 or less and an upper of 0 or more")
-        if self.approach is not None and (self.orientation is None or max(map(abs, self.approach)) < 1e-6):
-            raise ValueError("expected an approach that is not zero, beside an orientation")
+        if self.approach is not None and self.orientation is None:
+            raise ValueError("expected an orientation beside an approach")
         if self.approach is not None and self.free_turn is not None:
             along = ["xyz"[k] for k in range(3) if self.approach[k]]
             if along != [self.free_turn]:
@@ -212,7 +212,7 @@ class GraspGoal(StrictModel):
 
     object: Name
     hand: Name
-    approach: Vector | None = None
+    approach: Approach | None = None
     remaining: Vector | None = None
 
 

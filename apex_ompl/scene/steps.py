@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -18,10 +19,12 @@ from pydantic import (
     model_validator,
 )
 
-from apex_ompl.scene.bodies import BodyPair, Coordinate, Direction, Name, Size
+from apex_ompl.scene.bodies import BodyPair, Coordinate, Direction, Name, Size, Vector
 from apex_ompl.util.schema import StrictModel
 
 LONGEST_WAIT = 3600.0  # [s]
+SHORTEST_WAY = 1e-6  # of a displacement [m]
+LONGEST_APPROACH = 10.0  # from which millimeters are likely [m]
 
 Synergy = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -39,6 +42,19 @@ Names = Annotated[
     tuple[Name, ...], Field(min_length=1), BeforeValidator(_one_or_many, json_schema_input_type=Name | tuple[Name, ...])
 ]
 """A name, or several."""
+
+
+def _an_approach(way: Vector) -> Vector:
+    """Check a displacement along which a frame goes to its goal."""
+    if max(map(abs, way)) < SHORTEST_WAY:
+        raise ValueError("expected an approach that is not zero")
+    if max(map(abs, way)) >= LONGEST_APPROACH:
+        raise ValueError(f"expected a displacement of less than {LONGEST_APPROACH:g} m; lengths are meters")
+    return way
+
+
+Approach = Annotated[Vector, AfterValidator(_an_approach)]
+"""A displacement of a frame along its own axes, by which it goes straight to its goal [m]."""
 
 
 class Step(StrictModel):
@@ -108,7 +124,7 @@ class LineStep(MotionStep):
     def _one_end(self) -> Self:
         if (self.by is None) == (self.onto is None):
             raise ValueError("expected either by, a displacement, or onto, a contact face")
-        if self.by is not None and max(map(abs, self.by)) < 1e-6:
+        if self.by is not None and max(map(abs, self.by)) < SHORTEST_WAY:
             raise ValueError("expected a displacement by that is not zero")
         if self.by is not None and self.distance is not None:
             raise ValueError("distance is for onto, not for by")

@@ -226,6 +226,21 @@ def test_goals_are_mappings_as_in_files_too(robot: Robot) -> None:
             assert planner.problem("home", mapping).goal == planner.problem("home", same).goal
 
 
+def test_a_frame_that_the_group_does_not_move_is_named(robot: Robot) -> None:
+    left, right = (
+        PoseTarget(frame=f"{side}_hand", position=(0.5, y, 0.4)) for side, y in (("left", 0.2), ("right", -0.2))
+    )
+    at_home = PoseTarget(
+        frame="right_hand", position=tuple(hand_pose(robot, robot.home, "right_hand").translation.tolist())
+    )
+    with MotionPlanner(robot) as planner:
+        for goal in (right, [left, right], AnyOf([right, right])):
+            refused = planner.plan("home", goal, group="left_arm")
+            assert refused.reason == "right_hand is moved by none of the joints that are planned"
+        assert planner.plan("home", AnyOf([right, left]), group="left_arm")
+        assert planner.plan("home", [left, at_home], group="left_arm")
+
+
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
@@ -262,8 +277,9 @@ def test_faulty_goals_are_named(robot: Robot, goal: Any, message: str) -> None:
         ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (-90, 90)}, "in degrees it would be inside"),
         ({"tolerance": {"angle": 180.0}}, "tolerance.angle: expected an angle of at most 6.2832; angles are radians"),
         ({"lower": (0.1, 0.0, 0.0)}, "a lower of 0 or less"),
-        ({"approach": (0.0, 0.0, 0.1)}, "beside an orientation"),
+        ({"approach": (0.0, 0.0, 0.1)}, "an orientation beside an approach"),
         ({"orientation": (0, 0, 0, 1), "approach": (0.0, 0.0, 0.0)}, "an approach that is not zero"),
+        ({"orientation": (0, 0, 0, 1), "approach": (0, 0, 100)}, "approach: expected .* less than 10 m.* are meters"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "x", "approach": (0, 0, 0.1)}, "along the axis of the free turn"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "w"}, "'x', 'y' or 'z'"),
     ],
