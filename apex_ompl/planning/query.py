@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -160,12 +160,12 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
     return Goal(joints=tuple(several))
 
 
-def _is_in_files(target: Any) -> bool:
+def _is_in_files(target: Any) -> TypeGuard[GoalFields]:
     """Whether a goal is a mapping of the kinds of goals in files, not of joints."""
     return isinstance(target, Mapping) and any(kind in target for kind in GOALS)
 
 
-def _read_goal(robot: Robot, target: Mapping[str, Any], held: Mapping[str, float]) -> Goal:
+def _read_goal(robot: Robot, target: GoalFields, held: Mapping[str, float]) -> Goal:
     """Return a goal in files as a record; states in it are those of plans, with joints that stay.
 
     Raises:
