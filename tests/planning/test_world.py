@@ -187,7 +187,8 @@ def test_files_are_paths_or_content_from_memory_and_long_bodies_are_noted(robot:
         planner.world.add(name="floor", box=(100.0, 100.0, 0.1), position=(0.0, 0.0, -0.5))
         result = planner.plan("home", {**dict(zip(robot.joint_names, robot.home, strict=True)), "left_joint1": 0.1})
         assert "floor is 100 m long; lengths are meters" in result.notes
-        planner.world.add(name="far", mesh={"file": file, "scale": (80.0, 80.0, 80.0)}, position=far)
+        unread = {"file": "no_file.obj", "content": file.read_bytes(), "scale": (80.0, 80.0, 80.0)}
+        planner.world.add(name="far", mesh=unread, position=far)
         planner.world.move("far", (0.0, 0.0, -200.0))
         assert "far is 80 m long; lengths are meters" in planner.plan("home", "home").notes
     with pytest.raises(FileFormatError, match="mesh file ending in"):
