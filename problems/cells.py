@@ -17,7 +17,7 @@ from apex_ompl.robot import load_robot
 from apex_ompl.scene.bodies import pose_fields
 from apex_ompl.scene.problem import Problem
 from apex_ompl.types import Array
-from apex_ompl.util.validation import check_name
+from apex_ompl.util.validation import check_name, check_seed
 
 DOWN = pin.rpy.rpyToMatrix(np.pi, 0.0, 0.0)  # a gripper whose z axis points down
 GRASPS = 50  # of the box in a bin
@@ -42,8 +42,10 @@ def draw(kind: str, seed: int) -> Problem:
 
     Raises:
         UnknownNameError: There is no such kind.
+        ParameterError: The seed is no whole number from 0 on.
     """
     check_name(kind, "kind of cell", KINDS)
+    check_seed(seed)
     rng = np.random.default_rng([tuple(KINDS).index(kind), seed])
     data = KINDS[kind](rng)
     return Problem.parse({"schema": "apex-ompl/problem/1", "name": f"{kind}-{seed}", **data}, f"{kind}-{seed}")

@@ -7,10 +7,10 @@ from types import MappingProxyType
 from typing import Any
 
 from apex_ompl.collision.mesh_stage import MeshStage
-from apex_ompl.collision.shapes import coal_geometry, extent_in_link, mesh_note, with_file_read, world_geometry
+from apex_ompl.collision.shapes import body_note, coal_geometry, extent_in_link, with_file_read, world_geometry
 from apex_ompl.errors import SceneError, UnknownNameError
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid, size_note
+from apex_ompl.scene.bodies import AttachedObject, Body, Obstacle, file_shape, given_fields, same_solid
 from apex_ompl.scene.scripts import moved_to, standing
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line, progress
@@ -116,9 +116,13 @@ class SceneBodies:
         """Return an obstacle, which is not a fixture of the robot's.
 
         Raises:
-            SceneError: There is no such obstacle.
+            SceneError: There is no such obstacle, or it is a fixture of the robot.
         """
         found = self._obstacles.get(name) if isinstance(name, str) else None
+        if found is not None and name in self._fixtures:
+            what = "it is a fixture of the robot, where it stays"
+            instead = "world.allow lets bodies touch it, and a step 'remove' of a sequence takes it away"
+            raise SceneError(f"no obstacle {name!r}; {what}: {instead}")
         if not isinstance(found, Obstacle):
             raise SceneError(f"no obstacle {name!r}; there are: {', '.join(self.obstacles) or 'none'}")
         return found
@@ -148,7 +152,7 @@ class SceneBodies:
         obstacle = with_file_read(obstacle)
         self.meshes.add(obstacle.name, *world_geometry(obstacle))
         self._put(obstacle)
-        if note := mesh_note(obstacle) or size_note(obstacle):
+        if note := body_note(obstacle):
             self._notes[obstacle.name] = note
         self._obstacles_changed()
 
@@ -233,7 +237,7 @@ class SceneBodies:
         self.meshes.attach(held, geometry, held.pose)
         self._attached[held.name] = held
         self._extents[held.name] = held.link, extent_in_link(geometry, held.pose)
-        if note := mesh_note(held):
+        if note := body_note(held):
             self._notes[held.name] = note
         self._held_changed()
 

@@ -22,7 +22,17 @@ from numpy.typing import NDArray
 
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel.distance_grid import grid_of_triangles_beside
-from apex_ompl.scene.bodies import AttachedObject, Body, BodyT, GridFile, MeshFile, PointFile, file_shape, located
+from apex_ompl.scene.bodies import (
+    AttachedObject,
+    Body,
+    BodyT,
+    GridFile,
+    MeshFile,
+    PointFile,
+    file_shape,
+    located,
+    size_note,
+)
 from apex_ompl.scene.grids import parse_surface
 from apex_ompl.scene.mesh_files import read_mesh
 from apex_ompl.scene.meshes import (
@@ -146,6 +156,21 @@ def mesh_note(body: Body) -> str:
         return ""
     note = surface_note(*triangles(coal_geometry(body)))
     return f"the mesh of {body.name!r} ({Path(body.mesh.file).name}) {note}" if note else ""
+
+
+def body_note(body: Body) -> str:
+    """Return what is odd about a body: a mesh that is no proper solid, or a length of another unit; else nothing.
+
+    Raises:
+        MissingFileError: The file cannot be read.
+        FileFormatError: The file holds no solid.
+    """
+    longest = 0.0
+    if file_shape(body) is not None:
+        geometry = coal_geometry(body)
+        geometry.computeLocalAABB()
+        longest = float((geometry.aabb_local.max_ - geometry.aabb_local.min_).max())
+    return "; ".join(filter(None, (mesh_note(body), size_note(body, longest))))
 
 
 def _load(name: str, shape: MeshFile | PointFile | GridFile) -> coal.CollisionGeometry:

@@ -28,6 +28,7 @@ TURNING = 6  # joints with which an arm reaches turns that are drawn
 MEANT = "positions are meters and quaternions [x, y, z, w]"
 HINTS = 32  # descents by which another reading of poses is tried
 FAR = 10.0  # coordinate from which millimeters are likely [m]
+STAYS = 1e-8  # range of a joint that is not planned, at most [rad]
 RESIDUAL = 1e-6  # largest residual at which inverse kinematics ends
 
 
@@ -140,14 +141,18 @@ class PoseGoal:
         return targets
 
     def out_of_reach(self, base: Array | None = None) -> str:
-        """Return why a pose is farther away than the arm is long, or nothing where that is not shown.
+        """Return why a pose is farther away than the arm is long, or not moved to, or nothing where that is not shown.
 
         Args:
             base: Values of the joints that do not move, shape (dof,), by default those of the start.
         """
-        at, free = self.start if base is None else base, self.inverse.free
-        faults = (too_far(self.robot, *one, at, free) for one in zip(self.poses, self.frames, strict=True))
-        return next(filter(None, faults), "")
+        at, limits, free = self.start if base is None else base, self.robot.limits, self.inverse.free
+        free = free[limits.upper[free] - limits.lower[free] > STAYS]
+        for pose, frame, place in zip(self.poses, self.frames, self.placements(at), strict=True):
+            one = PoseGoal(self.robot, [pose], self._attached, self.start)
+            if not within(one.errors(at, [place]), one.bounds) and (far := too_far(self.robot, pose, frame, at, free)):
+                return far
+        return ""
 
     def hint(self) -> str:
         """Return as what poses that are out of reach may be meant, if they can be reached as that; else nothing."""

@@ -1,4 +1,4 @@
-"""Poses that are out of reach by the length of an arm, which is shown and not tried."""
+"""Poses that are out of reach by the length of an arm, or since no joint moves the frame: shown, and not tried."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ ROUNDING = 1e-6  # by which a pose out of reach is farther than the arm is long 
 
 
 def too_far(robot: Robot, pose: PoseTarget, frame: Frame, base: Array, free: NDArray[np.int64]) -> str:
-    """Return why a pose is out of reach by the length of the links, or nothing.
+    """Return why a pose is out of reach by the length of the links, or since no joint moves its frame, or nothing.
 
+    A frame that none of the joints moves is taken to be somewhere else.
     The distance between the origins of the first and the last moved joint is at most the sum of the offsets between
     joints in between; an orientation that is given without a free turn places the origin of the last one, and otherwise
     the frame's own.
@@ -32,7 +33,9 @@ def too_far(robot: Robot, pose: PoseTarget, frame: Frame, base: Array, free: NDA
         joint = int(model.parents[joint])
     planned = [int(robot.state_order[model.joints[j].idx_q]) if model.joints[j].nq else -1 for j in chain]
     moved = [k for k, one in enumerate(planned) if one in {*free.tolist()}]
-    if not moved or any("R" not in model.joints[j].shortname() for j in chain):
+    if not moved:
+        return f"{pose.frame} is moved by none of the joints that are planned"
+    if any("R" not in model.joints[j].shortname() for j in chain):
         return ""
     first, last = chain[moved[0]], chain[-1]
     length = sum(float(np.linalg.norm(model.jointPlacements[j].translation)) for j in chain[moved[0] + 1 :])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 from weakref import ref
 
@@ -252,7 +252,7 @@ class FullCheck:
         ok: Whether the path is a solution.
         reason: One sentence about the first fault found, empty when there is none.
         segment: Index of the segment (states k and k + 1) with the fault, or None.
-        proof: The proof, or None where limits or ends are at fault.
+        proof: The proof, or None where limits or ends are at fault. Where bodies overlap its pair is the deepest one.
         timed_out: Whether the time was over before the path was proved.
         constraints: Bounds on the violation of constraints along the path, or None without constraints.
     """
@@ -331,7 +331,11 @@ def full_check(
     if proof.timed_out:
         return FullCheck(False, proof.reason, None, proof, True)
     contacts = checker.contacts(proof.state) if np.isfinite(proof.state).all() and proof.clearance <= 0.0 else []
-    reason = str(contacts[0]) if contacts else proof.reason
+    reason = proof.reason
+    if contacts:
+        deepest = contacts[0]
+        reason = str(deepest)
+        proof = replace(proof, clearance=-deepest.depth, pair=(deepest.first, deepest.second))
     if motion is not None:
         return FullCheck(False, f"at {proof.parameter:.3f} s: {reason}", None, proof)
     lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(states, axis=0)).max(axis=1))])

@@ -51,6 +51,7 @@ SWEPT_SHARE = 0.3  # of the time that is left, for that
 SWEPT_STEP, MOST_COPIES = 0.05, 100  # spacing of their places [m], and the largest number of these
 NEAREST_GOALS = 2  # nearest goals of which there are several
 PERTURBATIONS = 4  # of the straight line to each goal
+LEAST = 0.2  # duration from which on motions are tried where the goal is the start [s]
 
 
 @dataclass(frozen=True)
@@ -256,7 +257,7 @@ def space_time_motion(context: InTime, motion: Trajectory, turn: int, shorter: f
     optimizer, found = context.optimizer(), None
     for factor in FACTORS:
         for initial in _initial_motions(context.query, context.limits, motion, turn):
-            duration = factor * 2.0 ** min(turn, LONGER) * initial.duration
+            duration = factor * 2.0 ** min(turn, LONGER) * max(initial.duration, LEAST)
             if context.stop():
                 break
             if duration >= shorter:

@@ -17,6 +17,8 @@ from apex_ompl.ompl.setup import constraint_set, state_fault
 from apex_ompl.ompl.validity import FullCheck, full_check
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.query import State, state_array
+from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.result import PlanResult
 from apex_ompl.scene.constraints import Constraint
 from apex_ompl.scene.problem import Problem
 from apex_ompl.timing import Trajectory
@@ -59,9 +61,10 @@ class ProofResult:
         segment: Number k of the segment between the states k and k + 1 of a path that fails, or None.
         time: When a motion fails [s], NaN for a path.
         state: The state that collides, shape (dof,), or None where another fault was found first.
-        clearance: Least distance of a pair of bodies along it [m], NaN where it was not determined.
+        clearance: Least distance of a pair of bodies along it [m]; the negative depth of the deepest pair where the
+            state collides; NaN where it was not determined.
         clearance_bound: Proved lower bound of it [m]; 0 without a proof.
-        clearance_pair: The two bodies there; empty where there are none.
+        clearance_pair: The two bodies of that pair; empty where there are none.
     """
 
     reason: str
@@ -88,14 +91,14 @@ def check_state(checker: CollisionChecker, q: Array) -> StateCheck:
 
 
 def prove(
-    checker: CollisionChecker, path: Sequence[State] | ArrayLike | Path | Trajectory,
+    checker: CollisionChecker, path: Sequence[State] | ArrayLike | Path | Trajectory | PlanResult,
     problem: Callable[[Array], Problem], constraints: Sequence[Constraint | UserConstraint],
 ) -> ProofResult:  # fmt: skip
     """Return the outcome of the full check of a path or a motion, limits of a motion's derivatives included.
 
     Args:
         checker: Checker of the world.
-        path: States, or a motion.
+        path: States, a motion, or the result of a plan: its motion, or its path where it has none.
         problem: Returns the problem of the world with a start, for constraints that are relative to it.
         constraints: Constraints along the path.
 
@@ -126,6 +129,14 @@ def prove(
 def _checked(checker: CollisionChecker, path: Any) -> Array | Trajectory:
     """Return a path as states, shape (N, dof), or a motion."""
     robot = checker.robot
+    if isinstance(path, TaskResult):
+        wanted = "a path or a motion, as the trajectory of this task, whose steps may change the world"
+        raise ParameterError("path", path, wanted)
+    if isinstance(path, PlanResult):
+        made = path.path if path.trajectory is None else path.trajectory
+        if made is None:
+            raise ParameterError("path", path, "a result with a path or a motion")
+        path = made
     if isinstance(path, Trajectory):
         if tuple(path.joint_names) != robot.joint_names:
             names = ", ".join(path.joint_names)
@@ -134,7 +145,7 @@ def _checked(checker: CollisionChecker, path: Any) -> Array | Trajectory:
     if isinstance(path, Path):
         path = path.states
     if isinstance(path, str | Mapping):
-        raise ParameterError("path", path, "several states, a Path or a Trajectory")
+        raise ParameterError("path", path, "several states, a Path, a Trajectory or a PlanResult")
     if isinstance(path, Sequence) and any(isinstance(one, str | Mapping) for one in path):
         path = [state_array(robot, one, "path") for one in path]
     states = finite_array(path, "path")

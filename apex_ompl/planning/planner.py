@@ -438,7 +438,7 @@ class MotionPlanner:
             )  # fmt: skip
 
     def prove(
-        self, path: Sequence[State] | ArrayLike | Path | Trajectory, *,
+        self, path: Sequence[State] | ArrayLike | Path | Trajectory | PlanResult, *,
         constraints: Sequence[Constraint | UserConstraint] = (),
     ) -> ProofResult:  # fmt: skip
         """Prove a path or a motion of your own in the world as it is now: the full check that each plan passes.
@@ -447,8 +447,8 @@ class MotionPlanner:
         collision from end to end, between its states, too.
 
         Args:
-            path: States that are joined by straight lines, shape (N, dof), or a timed motion of all joints, which is
-                proved along its own cubic pieces.
+            path: States that are joined by straight lines, shape (N, dof); or a timed motion of all joints, which is
+                proved along its own cubic pieces; or the result of a plan, of which that is its motion or its path.
             constraints: Constraints along it.
 
         Raises:

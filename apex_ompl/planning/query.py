@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +13,7 @@ from apex_ompl.collision.proved_share import share_note
 from apex_ompl.errors import ParameterError
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import Obstacle
-from apex_ompl.scene.problem import Alignment, Goal, PoseTarget, Problem
+from apex_ompl.scene.problem import GOALS, Alignment, Goal, PoseTarget, Problem
 from apex_ompl.types import Array
 from apex_ompl.util.schema import validate
 from apex_ompl.util.validation import check_name, finite_array
@@ -39,7 +39,7 @@ class AnyOf:
 
     Attributes:
         goals: The goals: states, by name, joint or in order, poses, lists of poses that are reached together,
-            alignments, or goals of problems.
+            alignments, or goals of problems, as records or as in files.
     """
 
     goals: Sequence[Any]
@@ -58,7 +58,12 @@ class AnyOf:
 Group = str | Sequence[str]
 """Joints that a plan moves: name of a group of the robot, or names of groups and joints."""
 
-Target = State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal | AnyOf | GoalSampler
+GoalFields = Mapping[str, Any]
+"""A goal as in problem files, such as ``{"grasp": {"object": "box", "hand": "hand"}}``."""
+
+Target = (
+    State | Sequence[State] | PoseTarget | Sequence[PoseTarget] | Alignment | Goal | GoalFields | AnyOf | GoalSampler
+)
 """A goal: a state, several of which any will do, shape (goals, dof), poses of one frame or more, an alignment of held
 objects, the goal of a problem, any of several goals, or an object that draws states."""
 
@@ -129,10 +134,12 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
 
     Raises:
         ParameterError: A state has not the robot's shape, or there is none.
-        FileFormatError: Two poses are given for one frame.
+        FileFormatError: Two poses are given for one frame, or a goal as in files is faulty.
     """
     if isinstance(target, Goal):
         return target
+    if _is_in_files(target):
+        return _read_goal(robot, target, held)
     if isinstance(target, AnyOf):
         records = [goal_record(robot, one, held) for one in target.goals]
         return validate(Goal, {"any_of": tuple(records)}, "goal")
@@ -151,6 +158,24 @@ def goal_record(robot: Robot, target: Target, held: Mapping[str, float]) -> Goal
     if not several:
         raise ParameterError("goal", target, "a state, or several")
     return Goal(joints=tuple(several))
+
+
+def _is_in_files(target: Any) -> TypeGuard[GoalFields]:
+    """Whether a goal is a mapping of the kinds of goals in files, not of joints."""
+    return isinstance(target, Mapping) and any(kind in target for kind in GOALS)
+
+
+def _read_goal(robot: Robot, target: GoalFields, held: Mapping[str, float]) -> Goal:
+    """Return a goal in files as a record; states in it are those of plans, with joints that stay.
+
+    Raises:
+        ApexError: It is faulty.
+    """
+    if set(target) == {"joints"}:
+        return goal_record(robot, target["joints"], held)
+    if set(target) == {"any_of"}:
+        return goal_record(robot, AnyOf(target["any_of"]), held)
+    return validate(Goal, dict(target), "goal")
 
 
 def sampled_goals(
@@ -183,7 +208,8 @@ def sampled_goals(
 def _several(target: Any) -> Sequence[Any]:
     if isinstance(target, str | Mapping):
         return [target]
-    if isinstance(target, Sequence) and any(isinstance(one, PoseTarget | Alignment | Goal | AnyOf) for one in target):
+    records = PoseTarget | Alignment | Goal | AnyOf
+    if isinstance(target, Sequence) and any(isinstance(one, records) or _is_in_files(one) for one in target):
         raise ParameterError("goal", target, "states alone, poses alone, or AnyOf of both")
     if isinstance(target, Sequence) and target and any(isinstance(one, str | Mapping) for one in target):
         return target

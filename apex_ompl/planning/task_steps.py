@@ -20,7 +20,7 @@ from apex_ompl.paths.path import Path, abreast
 from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
 from apex_ompl.planning.task_constraints import StepConstraints
-from apex_ompl.planning.task_waypoints import LATE, StepFailed, checked, held_pose, waypoints
+from apex_ompl.planning.task_waypoints import LATE, StepFailed, check_near, checked, held_pose, waypoints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
@@ -214,8 +214,10 @@ class StepPlanner:
         """Return the state after a hand has opened or closed, shape (dof,).
 
         Raises:
-            StepFailed: The open hand is in contact with what it is to hold.
+            StepFailed: The open hand is in contact with what it is to hold, or far away from it.
         """
+        if isinstance(step, GraspStep):
+            check_near(self.checker, during, step, q)
         synergy, to, end = self.robot.hands[step.hand].synergy, step.to, q.copy()
         if isinstance(step, GraspStep) and to is None and synergy is not None:
             to = self._closed(during, step, q)

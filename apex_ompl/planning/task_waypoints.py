@@ -1,4 +1,4 @@
-"""Poses that the frames of a step along straight lines go through."""
+"""Poses that frames go through in steps along straight lines, and whether what a hand takes is near it."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import pinocchio as pin
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
+from apex_ompl.collision.solids import Solid, box_distances, closest, world_boxes
 from apex_ompl.constraints.frames import frame_of
 from apex_ompl.ompl.validity import FullCheck
-from apex_ompl.planning.task_world import TaskWorld
-from apex_ompl.scene.steps import LineStep, RetreatStep, StraightStep, TurnStep
+from apex_ompl.planning.task_world import TaskWorld, hand_links
+from apex_ompl.scene.steps import GraspStep, LineStep, RetreatStep, StraightStep, TurnStep
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
 
@@ -151,6 +152,34 @@ def _share(world: TaskWorld, moves: Mapping[str, Array], gap: float, q: Array) -
             share += (away - gap) / size
         least = min(least, share) if others else least
     return least
+
+
+def check_near(checker: CollisionChecker, during: TaskWorld, step: GraspStep, q: Array) -> None:
+    """Check that an object is not farther from the hand that takes it than the hand is long, its grasp point included.
+
+    Args:
+        checker: A checker of the robot.
+        during: The world in which the hand holds the object.
+        step: The step.
+        q: State at which it is taken, shape (dof,).
+
+    Raises:
+        StepFailed: It is farther away.
+    """
+    robot, links, meshes = during.robot, hand_links(during.robot, step.hand), checker.meshes
+    solids = [solid for k in range(meshes.links) if (solid := meshes.solids[k]).name in links]
+    hand, data = robot.hands[step.hand], robot.model.createData()
+    pin.forwardKinematics(robot.model, data, robot.to_pinocchio(q))
+    poses = [data.oMi[solid.joint] * solid.placement for solid in solids]
+    palm = robot.link_pose(q, hand.palm)
+    point = pin.SE3(np.eye(3), palm[:3, :3] @ np.asarray(hand.point, float) + palm[:3, 3])
+    solids, poses = [*solids, Solid(step.hand, 0, point, coal.Sphere(NEAR))], [*poses, point]
+    placed = pin.SE3(held_pose(during, step.object, q))
+    taken, boxes = Solid(step.object, 0, placed, coal_geometry(during.held[step.object])), world_boxes(solids, poses)
+    size = length(boxes[:, 1].max(axis=0) - boxes[:, 0].min(axis=0))
+    if box_distances(boxes, world_boxes([taken], [placed])).min() > size:
+        away = closest(solids, poses, [taken], [placed]).value
+        raise StepFailed(f"{step.object} is about {away:.1f} m away from {step.hand}, farther than the hand is long")
 
 
 def held_pose(world: TaskWorld, name: str, q: Array) -> Array:

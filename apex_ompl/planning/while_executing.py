@@ -57,6 +57,7 @@ from apex_ompl.result import PlanResult, PlanStatus
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Timing, Trajectory
+from apex_ompl.timing.combination import rest
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import distinct
 from apex_ompl.util.clocks import Deadline, timed
@@ -222,9 +223,10 @@ def plan_beside(
         KeyboardInterrupt: Ctrl-C was pressed; planning ended in good order first.
     """
     options.check()
-    if not options.timing or options.leave_contact:
-        wanted = "True or a Timing, and no contact to leave, with while_executing"
-        raise ParameterError("timing", options.timing, wanted)
+    if not options.timing:
+        raise ParameterError("timing", options.timing, "True or a Timing with while_executing")
+    if options.leave_contact:
+        raise ParameterError("leave_contact", options.leave_contact, "no contact to leave with while_executing")
     timing = Timing() if options.timing is True else options.timing
     parameters = parameters_of(planner, model, options)
     with quiet_ompl(), Interrupt() as interrupt, running(interrupt.end):
@@ -276,17 +278,19 @@ def _plan_beside(
     def assembled(problem: Problem, checker: CollisionChecker) -> PlanningSetup:
         return ompl_setup.assemble(problem, robot, seed, checker, asked.planned, constraints=constraints)
 
-    at_end, without = assembled(problem, checker), without_given(checker, given)
+    at_end, others = assembled(problem, checker), without(checker, tuple(given.columns.tolist()))
     if at_end.start_fault and not len(at_end.goals):  # goals are not sampled from a start in collision
-        at_end = assembled(problem, without)
+        at_end = assembled(problem, others)
     first = given.placed(at_end.start, 0.0)
     began = problem.model_copy(update={"start": dict(zip(names, first.tolist(), strict=True))})
     goals = [goal for goal in at_end.valid_goals if not state_fault(checker, goal)]
     states = tuple(dict(zip(names, goal.tolist(), strict=True)) for goal in goals)
-    query = query_of(at_end if not states else assembled(_with_goals(problem, states), without))
+    query = query_of(at_end if not states else assembled(_with_goals(problem, states), others))
     fault = state_fault(checker, first)
     if fault:
         return _unsolved(query, began, PlanStatus.INVALID_START, f"at 0 s: {fault}")
+    if fault := _given_fault(checker, asked, first, sampled=True):
+        return _unsolved(query, began, PlanStatus.INVALID_START, fault)
     if not states:
         reason = query.reason or "; ".join(state_fault(checker, goal) for goal in at_end.valid_goals)
         return _unsolved(query, began, PlanStatus.INVALID_GOAL, f"after the given motion: {reason}")
@@ -305,8 +309,28 @@ def _plan_beside(
             found = _in_time(context, still, at_rest, simplify)
     if found is not None:
         return finish(query, found)
+    if fault := _given_fault(checker, asked, first, sampled=False):
+        return _unsolved(query, began, PlanStatus.INVALID_START, fault)
     reason = f"no motion beside that of {', '.join(given.joint_names)} was found in time"
     return _unsolved(query, began, PlanStatus.TIMEOUT, reason)
+
+
+def _given_fault(checker: CollisionChecker, asked: Asked, first: Array, *, sampled: bool) -> str:
+    """Return why the given motion fails whatever the planned joints do, in one sentence; empty where it does not.
+
+    Args:
+        checker: The robot in the world.
+        asked: The given motion, and the joints that are planned.
+        first: The start, with the given values at time 0, shape (dof,).
+        sampled: Whether the motion is proved only where a state of some along it collides.
+    """
+    names = checker.robot.joint_names
+    alone = asked.given.combined(rest(first, 0.0, names))
+    if sampled and checker.are_free(alone(np.linspace(0.0, alone.duration, SAMPLES))).all():
+        return ""
+    columns = tuple(k for k, name in enumerate(names) if name in asked.planned)
+    reason = full_check(without(checker, columns), alone, first).reason
+    return reason and f"the motion of while_executing itself fails, {reason}"
 
 
 def _in_time(context: WhileExecuting, still: PlanResult, at_rest: PlanningSetup, simplify: bool) -> PlanResult | None:
@@ -367,10 +391,10 @@ def _with_goals(problem: Problem, states: Sequence[dict[str, float]]) -> Problem
     return problem.model_copy(update={"goal": Goal(joints=tuple(states))})
 
 
-def without_given(checker: CollisionChecker, given: GivenMotion) -> CollisionChecker:
-    """Return a checker in which what the given joints move may touch the rest of the robot and what that holds."""
+def without(checker: CollisionChecker, columns: tuple[int, ...]) -> CollisionChecker:
+    """Return a checker in which what some joints move may touch the rest of the robot and what that holds."""
     links, held = sorted({checker.meshes.solids[k].name for k in range(checker.meshes.links)}), checker.held
-    moved = moved_links(checker.robot, tuple(given.columns.tolist()))
+    moved = moved_links(checker.robot, columns)
     own = [link for link in links if link in moved] + [name for name, one in held.items() if one.link in moved]
     others = [link for link in links if link not in moved] + [name for name in held if name not in own]
     pairs = [*checker.allowed, *((one, other) for one in own for other in others)]

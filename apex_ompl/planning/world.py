@@ -197,7 +197,7 @@ class World:
         The places of a script move by as much.
 
         Raises:
-            SceneError: There is no such obstacle.
+            SceneError: There is no such obstacle, or it is a fixture of the robot.
             FileFormatError: The position or the orientation is not valid.
         """
         with self.lock:
@@ -208,7 +208,7 @@ class World:
         """Give an obstacle a constant velocity [m/s], or none, in place of a script that it may have.
 
         Raises:
-            SceneError: There is no such obstacle.
+            SceneError: There is no such obstacle, or it is a fixture of the robot.
             FileFormatError: The velocity is not valid.
         """
         with self.lock:
@@ -217,6 +217,9 @@ class World:
 
     def remove(self, name: str) -> None:
         """Remove an obstacle.
+
+        Fixtures belong to the robot: :meth:`allow` lets bodies touch them, and a step ``remove`` of a sequence takes
+        them away.
 
         Raises:
             SceneError: There is no such obstacle, or it is a fixture of the robot.

@@ -33,7 +33,7 @@ from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import narrowed
 from apex_ompl.util.display import counted, html_table, one_line
 from apex_ompl.util.schema import StrictModel
-from apex_ompl.util.validation import number_array, shape_error
+from apex_ompl.util.validation import degrees_hint, number_array, shape_error
 
 SHORTEST_RAMP = 1e-6  # from no acceleration to the largest, for motions whose knots have distinct times [s]
 LIMIT_SLACK = 1e-3  # by which a joint of a start or a goal may be outside its limits [rad; synergies 0..1]
@@ -273,8 +273,7 @@ class Robot:
         k = int(np.argmax(bad))
         by = max(low[k] - q[k], q[k] - high[k])
         amount = f"{by:.2g} " if by < LIMIT_SLACK else ""  # which may not show in the rounded value
-        degrees = abs(q[k]) > 2.0 * np.pi and low[k] <= np.radians(q[k]) <= high[k]
-        hint = "; in degrees it would be inside, and angles are radians" if degrees else ""
+        hint = degrees_hint(q[k], lambda angle: low[k] <= angle <= high[k])
         return f"{self.joint_names[k]} = {q[k]:.6g} is {amount}outside its limits [{low[k]:.6g}, {high[k]:.6g}]{hint}"
 
     def within_limits(self, states: Array) -> Array:
@@ -422,14 +421,14 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     groups = {g: np.array([names.index(n) for n in members]) for g, members in config.groups.items()}
     limits = _limits(config, model, path)
     effort = np.array([joint.effort for joint in config.joints.values()])
+    turning = np.array(["P" not in model.joints[model.getJointId(name)].shortname() for name in names])
     home = _nearly_inside(limits, np.array([joint.home for joint in config.joints.values()]))
     outside = ~((home >= limits.lower) & (home <= limits.upper))
     if outside.any():
-        name = names[int(np.argmax(outside))]
-        field_name, value = f"joints.{name}.home", config.joints[name].home
-        raise FileFormatError(str(path), field_name, value, "expected a value inside the limits")
-    poses = {HOME: home, **{pose: _posed(config, limits, pose, path) for pose in config.poses}}
-    turning = np.array(["P" not in model.joints[model.getJointId(name)].shortname() for name in names])
+        k = int(np.argmax(outside))
+        expected = _expected(limits, k, home[k], turning[k])
+        raise FileFormatError(str(path), f"joints.{names[k]}.home", float(home[k]), expected)
+    poses = {HOME: home, **{pose: _posed(config, limits, turning, pose, path) for pose in config.poses}}
     continuous = turning & (limits.lower <= -WIDEST) & (limits.upper >= WIDEST)
     weights = weights_of(limits, turning)
     for array in (weights, continuous, effort, *poses.values(), *vars(limits).values(), *groups.values(), order):
@@ -443,7 +442,7 @@ def build_robot(config: RobotConfig, path: Path) -> Robot:
     )  # fmt: skip
 
 
-def _posed(config: RobotConfig, limits: Limits, pose: str, path: Path) -> Array:
+def _posed(config: RobotConfig, limits: Limits, turning: Flags, pose: str, path: Path) -> Array:
     """Return a named pose as a state, shape (dof,).
 
     Raises:
@@ -453,8 +452,17 @@ def _posed(config: RobotConfig, limits: Limits, pose: str, path: Path) -> Array:
     q = _nearly_inside(limits, np.array([values.get(name, joint.home) for name, joint in config.joints.items()]))
     for k, name in enumerate(config.joints):
         if not limits.lower[k] <= q[k] <= limits.upper[k]:
-            raise FileFormatError(str(path), f"poses.{pose}.{name}", q[k], "expected a value inside the limits")
+            expected = _expected(limits, k, q[k], turning[k])
+            raise FileFormatError(str(path), f"poses.{pose}.{name}", float(q[k]), expected)
     return q
+
+
+def _expected(limits: Limits, k: int, value: float, turns: bool) -> str:
+    """Return what was expected in place of a value of the joint of number k, which may be one that turns."""
+    low, high = float(limits.lower[k]), float(limits.upper[k])
+    radians = "; angles are radians" if turns and abs(value) > TURN else ""
+    hint = degrees_hint(value, lambda angle: low <= angle <= high) or radians
+    return f"expected a value inside the limits [{low:.6g}, {high:.6g}]{hint}"
 
 
 def _state_order(config: RobotConfig, model: pin.Model, path: Path) -> NDArray[np.intp]:

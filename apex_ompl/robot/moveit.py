@@ -32,7 +32,6 @@ from apex_ompl.util.validation import is_integer
 
 MATRIX = "allowed_collision_matrix"
 SIDES = ("above", "below")  # of a joint's tolerances
-TURN = 3.14  # tolerance of an angle from which turns about an axis are free [rad]
 EXACT_ANGLE = 0.01  # tolerance up to which an orientation counts as fixed [rad]
 ALONG = 1e-3  # largest element of a rotation that counts as 0
 SAME_POINT = 1e-4  # largest distance between points that count as the same [m]
@@ -339,22 +338,14 @@ def _orientation_constraint(
     """
     link, base = reader.constrained_link(message, start, where)
     base = base @ reader.pose({"orientation": message.get("orientation")}, where)
-    keys = [f"absolute_{axis}_axis_tolerance" for axis in "xyz"]
-    tolerances = [reader.number(message.get(key, 0.0), f"{where}.{key}") for key in keys]
-    if min(tolerances) <= 0.0:
-        raise reader.fail(where, tolerances, "expected three tolerances of angles above 0")
-    free = [k for k in range(3) if tolerances[k] >= TURN]
-    kept = [value for value in tolerances if value < TURN]
-    if not kept:
+    free, angle = reader.angles(message, where)
+    if len(free) == 3:
         reader.notes.append(f"{where}: not used, any orientation is within its tolerances")
         return
-    if len(free) == 2:
-        raise reader.fail(where, tolerances, "cannot be read, expected at most one tolerance from pi, or three")
-    if min(kept) != max(kept):
-        reader.notes.append(f"{where}: its tolerances differ, and the smallest holds for all")
-    angle, orientation = min(*kept, np.pi / 2), {"orientation": pose_fields(base)["orientation"]}
+    angle, orientation = min(angle, np.pi / 2), {"orientation": pose_fields(base)["orientation"]}
     if free:
-        axis, up = np.eye(3)[free[0]], base[:3, free[0]]
+        k = "xyz".index(free[0])
+        axis, up = np.eye(3)[k], base[:3, k]
         fields = {"frame": link, "axis": tuple(axis.tolist()), "up": tuple(up.tolist()), "angle": angle}
         yield reader.record(Upright, fields, where)
     elif angle <= EXACT_ANGLE:
@@ -446,13 +437,10 @@ def _wanted_orientation(
     """Return the orientation of a pose and its free turn, where there are any, and add the tolerance of its angle."""
     _, base = reader.constrained_link(message, start, where)
     base = base @ reader.pose({"orientation": message.get("orientation")}, where)
-    angles = [reader.number(message.get(f"absolute_{axis}_axis_tolerance", 0.0), where) for axis in "xyz"]
-    free = [axis for axis, angle in zip("xyz", angles, strict=True) if angle >= TURN]
+    free, angle = reader.angles(message, where)
     if len(free) == 3:
         return {}
-    if len(free) == 2:
-        raise reader.fail(where, angles, "cannot be read, expected at most one tolerance from pi, or three")
-    tolerance["angle"] = min(angles)
+    tolerance["angle"] = angle
     turned = {"free_turn": free[0]} if free else {}
     return {"orientation": pose_fields(base)["orientation"], **turned}
 
@@ -482,15 +470,16 @@ def _joint_goals(
             if goal.get(other):
                 expected = "cannot be read, expected joint_constraints only, or position_constraints without these"
                 raise reader.fail(f"{where}.{other}", "a list", expected)
-        values = dict(start)
-        reached = False
-        for j, constraint in enumerate(reader.messages(goal, "joint_constraints", where)):
+        values, given, reached = dict(start), reader.messages(goal, "joint_constraints", where), False
+        for j, constraint in enumerate(given):
             at = f"{where}.joint_constraints.{j}"
             ours = reader.joint(str(constraint.get("joint_name")), at)
             if ours is not None:
                 values[ours], reached = reader.number(constraint.get("position"), f"{at}.position"), True
         if not reached:
-            raise reader.fail(where, sorted(goal), "expected joint_constraints on joints of the robot")
+            names = ", ".join(str(one.get("joint_name")) for one in given) or None
+            expected = f"expected joints of {reader.robot.name}; is a joint map missing?"
+            raise reader.fail(f"{where}.joint_constraints", names, expected)
         goals.append(values)
     if not goals:
         raise reader.fail("goal_constraints", None, "expected at least one goal")

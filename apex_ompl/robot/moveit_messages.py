@@ -24,6 +24,7 @@ PRIMITIVES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
 ADD, REMOVE = 0, 1  # operations of moveit_msgs/CollisionObject
 OPERATIONS = {"add": ADD, "remove": REMOVE}
 WORLD_FRAMES = ("", "world", "map")
+TURN = 3.14  # tolerance of an angle from which turns about an axis are free [rad]
 RecordT = TypeVar("RecordT", bound=StrictModel)
 
 
@@ -212,6 +213,20 @@ class RobotMessageReader(MessageReader):
             if model.frames[self.robot.link_frame(base)].parentJoint != 0:
                 raise self.fail(f"{where}.header.frame_id", name, "cannot be read, expected a frame that does not move")
         return link, self.frame(name, start, where)
+
+    def angles(self, message: Mapping[str, Any], where: str) -> tuple[list[str], float]:
+        """Return the axes about which turns are free, none, one or all, and the least tolerance of the others [rad]."""
+        keys = [f"absolute_{axis}_axis_tolerance" for axis in "xyz"]
+        angles = [self.number(message.get(key, 0.0), f"{where}.{key}") for key in keys]
+        if min(angles) <= 0.0:
+            raise self.fail(where, angles, "expected three tolerances of angles above 0")
+        free = [axis for axis, angle in zip("xyz", angles, strict=True) if angle >= TURN]
+        kept = [angle for angle in angles if angle < TURN]
+        if len(free) == 2:
+            raise self.fail(where, angles, "cannot be read, expected at most one tolerance from pi, or three")
+        if len({*kept}) > 1:
+            self.notes.append(f"{where}: its tolerances differ, and the smallest holds for all")
+        return free, min(kept, default=np.inf)
 
     def refuse(self, data: Mapping[str, Any], key: str, value: object, expected: str, where: str = "") -> None:
         """Raise a FileFormatError where a part of a message is there and not empty."""

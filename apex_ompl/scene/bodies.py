@@ -370,12 +370,17 @@ def given_fields(body: Body, left_out: Collection[str] = ()) -> dict[str, Any]:
     return {name: value for name, value in fields if value is not None}
 
 
-def size_note(body: Body) -> str:
-    """Return a sentence on a body that is so long that another unit is likely; else nothing."""
+def size_note(body: Body, longest: float = 0.0) -> str:
+    """Return a sentence on a body that is so long that another unit is likely; else nothing.
+
+    Args:
+        body: The body.
+        longest: Length of a shape in a file [m].
+    """
     bar = body.cylinder or body.capsule
     lengths = [*(body.box or ()), *([2.0 * body.sphere.radius] if body.sphere is not None else [])]
     lengths += [2.0 * bar.radius, bar.length] if bar is not None else []
-    longest = max(lengths, default=0.0)
+    longest = max([longest, *lengths])
     return f"{body.name} is {longest:g} m long; lengths are meters" if longest >= LONG else ""
 
 

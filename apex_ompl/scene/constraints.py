@@ -11,6 +11,7 @@ import math
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -32,6 +33,21 @@ Angle = Annotated[float, Field(gt=0.0, le=math.pi)]
 Freedom = Literal["x", "y", "z", "rx", "ry", "rz"]
 
 
+def _a_turn_at_most(angle: float) -> float:
+    if angle > 2.0 * math.pi:
+        raise ValueError("expected an angle of at most 6.2832; angles are radians")
+    return angle
+
+
+AngleTolerance = Annotated[PositiveFloat, AfterValidator(_a_turn_at_most)]
+
+
+def is_turn(least: float, largest: float) -> bool:
+    """Whether two angles are a range of at most a whole turn [rad]."""
+    whole = 2.0 * math.pi
+    return -whole <= least <= largest <= min(whole, least + whole)
+
+
 def _no_bound(infinite: float) -> BeforeValidator:
     """Return the conversion of an infinite bound to None, which files hold as null."""
     return BeforeValidator(lambda bound: None if isinstance(bound, float) and bound == infinite else bound)
@@ -50,7 +66,7 @@ class PoseTolerance(StrictModel):
     """Tolerance of a pose: distance [m] and angle [rad]."""
 
     position: PositiveFloat = 1e-3
-    angle: PositiveFloat = 1e-2
+    angle: AngleTolerance = 1e-2
 
 
 class Pose(StrictModel):

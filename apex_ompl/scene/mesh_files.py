@@ -13,6 +13,7 @@ import io
 import re
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO
 from xml.etree import ElementTree
 
@@ -44,7 +45,7 @@ def read_mesh(file: str, content: bytes) -> Triangles:
     """Return the triangles of a file, of all meshes that it holds.
 
     Args:
-        file: Its name, whose suffix tells the format; an ``.obj`` is read from that path.
+        file: Its name, whose suffix tells the format.
         content: Its content.
 
     Raises:
@@ -121,11 +122,14 @@ def read_off(_: str, content: bytes) -> Triangles:
     return np.array([point[:3] for point in points], float), np.concatenate([np.empty((0, 3), np.int64), *triangles])
 
 
-def read_obj(file: str, content: bytes) -> Triangles:
-    """Return the triangles of a Wavefront OBJ file, by Coal's importer."""
+def read_obj(_: str, content: bytes) -> Triangles:
+    """Return the triangles of a Wavefront OBJ file, by Coal's importer, which reads files alone."""
     # Trees of oriented boxes, which collisions need, are made of sound vertices only: Coal prints many lines else.
     try:
-        mesh = coal.MeshLoader(coal.BV_AABB).load(file, np.ones(3))
+        with TemporaryDirectory() as folder:
+            file = Path(folder, "mesh.obj")
+            file.write_bytes(content)
+            mesh = coal.MeshLoader(coal.BV_AABB).load(str(file), np.ones(3))
     except Exception as error:
         raise ValueError(content[:60].decode(errors="replace")) from error
     rows = [(t[0], t[1], t[2]) for t in map(mesh.tri_indices, range(mesh.num_tris))]

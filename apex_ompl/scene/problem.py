@@ -37,12 +37,13 @@ from apex_ompl.scene.bodies import (
     located,
     pose_matrix,
 )
-from apex_ompl.scene.constraints import AnyConstraint, PoseTolerance
-from apex_ompl.scene.steps import MotionStep, Names, SceneStep, SimultaneousStep, TogetherStep
+from apex_ompl.scene.constraints import AngleTolerance, AnyConstraint, PoseTolerance, is_turn
+from apex_ompl.scene.steps import Approach, MotionStep, Names, SceneStep, SimultaneousStep, TogetherStep
 from apex_ompl.types import Array
 from apex_ompl.util.display import counted, one_line
 from apex_ompl.util.files import path_text, write_atomically
 from apex_ompl.util.schema import StrictModel, check_version, dump_yaml, read_yaml, validate
+from apex_ompl.util.validation import degrees_hint
 
 SCHEMA = "apex-ompl/problem/1"
 
@@ -96,7 +97,7 @@ class Tolerance(StrictModel):
 
     lateral: PositiveFloat
     axial: PositiveFloat
-    angle: PositiveFloat
+    angle: AngleTolerance
 
 
 ALIGNMENT_DEFAULTS: dict[str, tuple[float, Tolerance]] = {
@@ -164,20 +165,19 @@ class PoseTarget(StrictModel):
     turn: tuple[float, float] | None = None
     lower: Vector = (0.0, 0.0, 0.0)
     upper: Vector = (0.0, 0.0, 0.0)
-    approach: Vector | None = None
+    approach: Approach | None = None
 
     @model_validator(mode="after")
     def _a_region(self) -> Self:
         if self.free_turn is not None and self.orientation is None:
             raise ValueError("expected an orientation beside free_turn")
-        if self.turn is not None and (self.free_turn is None or not _is_turn(*self.turn)):
-            raise ValueError(
-                "expected turn: [least, largest] inside [-6.2832, 6.2832], at most 6.2832 apart, beside a free_turn"
-            )
+        if self.turn is not None and (self.free_turn is None or not is_turn(*self.turn)):
+            wanted = "[least, largest] inside [-6.2832, 6.2832], at most 6.2832 apart, beside a free_turn"
+            raise ValueError(f"expected turn: {wanted}{degrees_hint(self.turn, is_turn)}")
         if not all(low <= 0.0 <= high for low, high in zip(self.lower, self.upper, strict=True)):
             raise ValueError("expected a lower of 0 or less and an upper of 0 or more")
-        if self.approach is not None and (self.orientation is None or max(map(abs, self.approach)) < 1e-6):
-            raise ValueError("expected an approach that is not zero, beside an orientation")
+        if self.approach is not None and self.orientation is None:
+            raise ValueError("expected an orientation beside an approach")
         if self.approach is not None and self.free_turn is not None:
             along = ["xyz"[k] for k in range(3) if self.approach[k]]
             if along != [self.free_turn]:
@@ -200,12 +200,6 @@ class PoseTarget(StrictModel):
         return self.turn is None and not any(self.lower) and not any(self.upper)
 
 
-def _is_turn(least: float, largest: float) -> bool:
-    """Whether two angles are a range of at most a whole turn."""
-    whole = 2.0 * np.pi
-    return -whole <= least <= largest <= min(whole, least + whole)
-
-
 class GraspGoal(StrictModel):
     """A hand at any of the grasps of an object, an obstacle or one that another hand holds, where that is at the start.
 
@@ -218,7 +212,7 @@ class GraspGoal(StrictModel):
 
     object: Name
     hand: Name
-    approach: Vector | None = None
+    approach: Approach | None = None
     remaining: Vector | None = None
 
 

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -19,10 +20,12 @@ from pydantic import (
     model_validator,
 )
 
-from apex_ompl.scene.bodies import BodyPair, Coordinate, Direction, Name, Size
+from apex_ompl.scene.bodies import BodyPair, Coordinate, Direction, Name, Size, Vector
 from apex_ompl.util.schema import StrictModel
 
 LONGEST_WAIT = 3600.0  # [s]
+SHORTEST_WAY = 1e-6  # of a displacement [m]
+LONGEST_APPROACH = 10.0  # from which millimeters are likely [m]
 
 Synergy = Annotated[float, Field(ge=0.0, le=1.0)]
 
@@ -40,6 +43,19 @@ Names = Annotated[
     tuple[Name, ...], Field(min_length=1), BeforeValidator(_one_or_many, json_schema_input_type=Name | tuple[Name, ...])
 ]
 """A name, or several."""
+
+
+def _an_approach(way: Vector) -> Vector:
+    """Check a displacement along which a frame goes to its goal."""
+    if max(map(abs, way)) < SHORTEST_WAY:
+        raise ValueError("expected an approach that is not zero")
+    if max(map(abs, way)) >= LONGEST_APPROACH:
+        raise ValueError(f"expected a displacement of less than {LONGEST_APPROACH:g} m; lengths are meters")
+    return way
+
+
+Approach = Annotated[Vector, AfterValidator(_an_approach)]
+"""A displacement of a frame along its own axes, by which it goes straight to its goal [m]."""
 
 
 class Step(StrictModel):
@@ -109,7 +125,7 @@ class LineStep(MotionStep):
     def _one_end(self) -> Self:
         if (self.by is None) == (self.onto is None):
             raise ValueError("expected either by, a displacement, or onto, a contact face")
-        if self.by is not None and max(map(abs, self.by)) < 1e-6:
+        if self.by is not None and max(map(abs, self.by)) < SHORTEST_WAY:
             raise ValueError("expected a displacement by that is not zero")
         if self.by is not None and self.distance is not None:
             raise ValueError("distance is for onto, not for by")
@@ -203,6 +219,8 @@ class ReleaseStep(Step):
 
 class GraspStep(Step):
     """A hand closes on an obstacle, or on an object that another hand holds, and holds it.
+
+    An object that is farther away than the hand is long is not taken.
 
     Attributes:
         hand: Name of the hand.

@@ -6,7 +6,7 @@ All number and shape checks of the package are made here, so that their messages
 from __future__ import annotations
 
 import argparse
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -292,6 +292,18 @@ def check_times(times: Array, count: int | None = None) -> None:
     check_array(times, ("N" if count is None else count,), "times", finite=True, least=1)
     if times[0] != 0.0 or not (np.diff(times) > 0.0).all():
         raise ParameterError("times", times, "times that start at 0 and increase")
+
+
+def degrees_hint(angles: float | Sequence[float], is_inside: Callable[..., bool]) -> str:
+    """Return the end of a sentence on angles that would be valid in degrees, or an empty string.
+
+    Args:
+        angles: An angle or several, that are not valid.
+        is_inside: Whether angles in radians are valid, one argument each.
+    """
+    given = np.atleast_1d(np.asarray(angles, float))
+    degrees = np.abs(given).max() > 2.0 * np.pi and is_inside(*np.radians(given).tolist())
+    return "; in degrees it would be inside, and angles are radians" if degrees else ""
 
 
 def whole_number(text: str) -> int:

@@ -33,6 +33,7 @@ from apex_ompl.planning.task_problem import with_lines
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene import OnPlane
 from apex_ompl.scene.constraints import PoseTolerance
+from apex_ompl.scene.problem import Goal
 
 
 def hand_pose(robot: Robot, q: np.ndarray, hand: str = "left_hand") -> pin.SE3:
@@ -209,6 +210,37 @@ def test_goals_that_all_fail_say_so_in_a_sentence(robot: Robot) -> None:
     assert refused.status is PlanStatus.INVALID_GOAL and refused.reason.startswith("none found in ")
 
 
+def test_goals_are_mappings_as_in_files_too(robot: Robot) -> None:
+    place = tuple(hand_pose(robot, robot.home).translation.tolist())
+    grasp, grasps = {"object": "box", "hand": "left_hand"}, [{"position": (0, 0, 0), "orientation": (0, 0, 0, 1)}]
+    with MotionPlanner(robot) as planner:
+        planner.world.add(name="box", box=(0.02, 0.02, 0.02), position=place, grasps=grasps)
+        for mapping, same in (
+            ({"grasp": grasp}, Goal(grasp=grasp)),
+            ({"poses": [{"frame": "left_hand", "position": place}]}, PoseTarget(frame="left_hand", position=place)),
+            ({"joints": "home"}, "home"),
+            ({"joints": ["home", robot.home]}, ["home", dict(zip(robot.joint_names, robot.home, strict=True))]),
+            ({"any_of": [{"grasp": grasp}, "home"]}, AnyOf([Goal(grasp=grasp), "home"])),
+            (AnyOf([{"grasp": grasp}, {"joints": "home"}]), AnyOf([Goal(grasp=grasp), "home"])),
+        ):
+            assert planner.problem("home", mapping).goal == planner.problem("home", same).goal
+
+
+def test_a_frame_that_the_group_does_not_move_is_named(robot: Robot) -> None:
+    left, right = (
+        PoseTarget(frame=f"{side}_hand", position=(0.5, y, 0.4)) for side, y in (("left", 0.2), ("right", -0.2))
+    )
+    at_home = PoseTarget(
+        frame="right_hand", position=tuple(hand_pose(robot, robot.home, "right_hand").translation.tolist())
+    )
+    with MotionPlanner(robot) as planner:
+        for goal in (right, [left, right], AnyOf([right, right])):
+            refused = planner.plan("home", goal, group="left_arm")
+            assert refused.reason == "right_hand is moved by none of the joints that are planned"
+        assert planner.plan("home", AnyOf([right, left]), group="left_arm")
+        assert planner.plan("home", [left, at_home], group="left_arm")
+
+
 @pytest.mark.parametrize(
     ("goal", "message"),
     [
@@ -219,6 +251,11 @@ def test_goals_that_all_fail_say_so_in_a_sentence(robot: Robot) -> None:
         (lambda: AnyOf([PoseTarget(frame="hnd", position=(0.5, 0.0, 0.5))]), "unknown frame of a pose 'hnd'"),
         (lambda: AnyOf(["hme"]), "unknown pose"),
         (lambda: AnyOf([[1.0, 2.0]]), "goal: expected a state of shape"),
+        (lambda: {"grasp": {"object": "box"}}, "goal: grasp.hand: required key is missing"),
+        (lambda: {"grasp": {"object": "box", "hand": "left_hand"}}, "object"),
+        (lambda: {"grasp": {}, "left_joint1": 0.1}, "unknown key"),
+        (lambda: {"joints": {"left_joint1": 0.1}}, "joint .* is missing"),
+        (lambda: [{"grasp": {"object": "box", "hand": "left_hand"}}, "home"], "AnyOf of both"),
         (lambda: {"left_joint1": 0.1}, "joint .* is missing"),
         (lambda: AnyOf([{"left_joint1": 0.1}]), "joint .* is missing"),
     ],
@@ -236,9 +273,13 @@ def test_faulty_goals_are_named(robot: Robot, goal: Any, message: str) -> None:
         ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (1.0, 0.0)}, "least, largest"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (-3.2, 3.2)}, "at most 6.2832 apart"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (6.0, 6.3)}, "inside .-6.2832, 6.2832"),
+        ({"turn": (-90.0, 90.0)}, "beside a free_turn; in degrees it would be inside"),
+        ({"orientation": (0, 0, 0, 1), "free_turn": "z", "turn": (-90, 90)}, "in degrees it would be inside"),
+        ({"tolerance": {"angle": 180.0}}, "tolerance.angle: expected an angle of at most 6.2832; angles are radians"),
         ({"lower": (0.1, 0.0, 0.0)}, "a lower of 0 or less"),
-        ({"approach": (0.0, 0.0, 0.1)}, "beside an orientation"),
+        ({"approach": (0.0, 0.0, 0.1)}, "an orientation beside an approach"),
         ({"orientation": (0, 0, 0, 1), "approach": (0.0, 0.0, 0.0)}, "an approach that is not zero"),
+        ({"orientation": (0, 0, 0, 1), "approach": (0, 0, 100)}, "approach: expected .* less than 10 m.* are meters"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "x", "approach": (0, 0, 0.1)}, "along the axis of the free turn"),
         ({"orientation": (0, 0, 0, 1), "free_turn": "w"}, "'x', 'y' or 'z'"),
     ],

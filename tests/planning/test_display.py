@@ -235,7 +235,7 @@ def test_the_signature_of_a_record_is_as_it_is_written() -> None:
         "(*, frame: Name, position: Vector, orientation: Quaternion | None = None, "
         "tolerance: PoseTolerance = PoseTolerance(), free_turn: Literal['x', 'y', 'z'] | None = None, "
         "turn: tuple[float, float] | None = None, lower: Vector = (0.0, 0.0, 0.0), "
-        "upper: Vector = (0.0, 0.0, 0.0), approach: Vector | None = None)"
+        "upper: Vector = (0.0, 0.0, 0.0), approach: Approach | None = None)"
     )
     assert re.search(r"joints: tuple\[JointValues, \.\.\.\] \| None = None", str(inspect.signature(Goal)))
     assert "model_copy" in dir(target) and target.model_copy() == target

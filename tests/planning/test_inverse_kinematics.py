@@ -204,9 +204,13 @@ def test_named_poses_of_a_robot_file_are_states(tmp_path: Path) -> None:
         assert several and np.array_equal(several.path.states[-1], robot.poses["ready"])
         with pytest.raises(ApexError, match="did you mean 'ready'"):
             planner.check("redy")
-    for faulty in ("poses: {ready: {trn: 0.5}}", "poses: {ready: {turn: 5}}", "poses: {home: {turn: 0.5}}"):
-        file.write_text(file.read_text().rsplit("poses", 1)[0] + faulty)
-        with pytest.raises(ApexError, match="poses|pose 'ready'"):
+    for faulty, words in (
+        ("{ready: {trn: 0.5}}", "pose 'ready'"), ("{ready: {turn: 5}}", r"ready.turn: .*\], got 5\.0"),
+        ("{ready: {turn: 90}}", "in degrees it would be inside.*got 90.0"),
+        ("{ready: {turn: -400}}", r"\]; angles are radians, got -400\.0"), ("{home: {turn: 0.5}}", "poses"),
+    ):  # fmt: skip
+        file.write_text(file.read_text().rsplit("poses", 1)[0] + f"poses: {faulty}")
+        with pytest.raises(ApexError, match=words):
             load_robot(file)
 
 

@@ -384,6 +384,14 @@ def test_grasps_are_poses_of_the_hand_where_the_object_is() -> None:
         ({"kind": "move", "goal": {"grasp": {"object": "cup", "hand": "hand"}}}, "expected an object: box"),
         ({"kind": "move", "goal": {"grasp": {"object": "box", "hand": "paw"}}}, "expected a hand: hand"),
         ({"kind": "move", "goal": {"grasp": {"object": "box", "hand": "hand"}}}, "expected an object with grasps"),
+        (
+            {"kind": "move", "goal": {"grasp": {"object": "box", "hand": "hand", "approach": (0, 0, 0)}}},
+            "goal.grasp.approach: expected an approach that is not zero",
+        ),
+        (
+            {"kind": "move", "goal": {"grasp": {"object": "box", "hand": "hand", "approach": (0, 0, 100)}}},
+            "goal.grasp.approach: expected a displacement of less than 10 m; lengths are meters",
+        ),
         ({"kind": "attach", "object": "cup", "link": "hand"}, "after.0.object: expected an obstacle: box"),
         ({"kind": "attach", "object": "box", "link": "foot"}, "expected a hand or a link of the robot"),
         ({"kind": "detach", "object": "box"}, "expected a held object: there is none"),
@@ -414,6 +422,14 @@ def test_faulty_steps_are_named(step: Any, words: str) -> None:
         with pytest.raises(ApexError) as raised:
             planner.sequence("home", [step])
         assert words in str(raised.value)
+
+
+@pytest.mark.parametrize(("x", "away"), [(0.62, ""), (1.5, "far is about 1.0 m away from left_hand")])
+def test_an_object_far_from_a_hand_is_not_grasped(x: float, away: str) -> None:
+    with MotionPlanner() as planner:
+        planner.world.add(name="far", box=(0.05, 0.05, 0.05), position=(x, 0.3, 0.5))
+        result = planner.sequence("home", [{"kind": "grasp", "hand": "left_hand", "object": "far"}])
+    assert bool(result) == (not away) and away in result.reason
 
 
 @pytest.mark.parametrize("kind", ["sequence", "plan"])
@@ -475,3 +491,6 @@ def test_cells_are_the_same_by_seed() -> None:
         assert Problem.parse(cells.draw(kind, 3).as_dict(), "again") == cells.draw(kind, 3)
     with pytest.raises(ApexError, match="kind of cell"):
         cells.draw("sorting", 0)
+    for seed in (-1, "a"):
+        with pytest.raises(ApexError, match="seed: expected a whole number"):
+            cells.draw("stacking", seed)  # type: ignore[arg-type]

@@ -39,6 +39,9 @@ def test_a_path_fails_where_the_checker_finds_the_contact(planner: MotionPlanner
     checker = CollisionChecker(robot, [post(robot)])
     assert not found and found.segment == 1 and found.state is not None and not checker.is_free(found.state)
     assert found.reason.startswith("between states 1 and 2: ") and "post" in found.reason and np.isnan(found.time)
+    worst = checker.contacts(found.state)[0]
+    assert found.clearance == -worst.depth == checker.clearance(found.state)
+    assert found.clearance_pair == (worst.first, worst.second) and str(worst) in found.reason
     free = planner.prove(swing(robot, 0.2))
     line = np.linspace(swing(robot, 0.2)[1], swing(robot, 0.2)[2], 50)
     assert free and free.clearance_bound > 0.0 and free.state is None
@@ -76,8 +79,21 @@ def test_faulty_paths_are_named(planner: MotionPlanner, robot: Robot) -> None:
     for path in (robot.home, np.empty((0, robot.dof)), np.full((2, robot.dof), np.nan), [[1.0, 2.0]], "home", ["hme"]):
         with pytest.raises(ApexError, match=r"path|unknown pose"):
             planner.prove(path)
-    with pytest.raises(ApexError, match="path: expected several states, a Path or a Trajectory"):
+    with pytest.raises(ApexError, match="path: expected several states, a Path, a Trajectory or a PlanResult"):
         planner.prove("home")
+
+
+def test_results_of_plans_are_proved_by_their_motion_or_path(planner: MotionPlanner, robot: Robot) -> None:
+    goal = swing(robot, 0.2)[2]
+    for timing in (True, False):
+        made = planner.plan("home", goal, timing=timing)
+        proof = planner.prove(made)
+        assert proof and proof.clearance_bound > 0.0
+    failed = planner.plan("home", swing(robot, -0.6)[2])
+    with pytest.raises(ApexError, match="path: expected a result with a path or a motion"):
+        planner.prove(failed)
+    with pytest.raises(ApexError, match="as the trajectory of this task"):
+        planner.prove(planner.sequence("home", [{"kind": "wait", "seconds": 0.1}]))
     motion = time_path(swing(robot, 0.2), robot.limits, robot.joint_names).trajectory
     with pytest.raises(ApexError, match="a motion of the 16 joints"):
         planner.prove(motion.selected(robot.joint_names[:2]))

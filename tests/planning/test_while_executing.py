@@ -148,6 +148,38 @@ def test_motions_are_optimized_in_space_and_time_beside_another(
     assert max(result.limit_use.values()) <= 1.0 + 1e-6
 
 
+@pytest.mark.parametrize("goal", ["there", "home"])
+def test_a_given_motion_that_collides_by_itself_is_named_at_once(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]], goal: str
+) -> None:
+    quarter = there_and_back(0.25 * there_and_back.duration)
+    place = tuple(planner.fk(quarter, "right_hand")[:3, 3])
+    planner.world.add(name="wall", box=(0.05, 0.05, 0.3), position=place)
+    try:
+        wanted = reached["left"] if goal == "there" else "home"
+        made = planner.plan("home", wanted, group="left_arm", while_executing=there_and_back, timeout=20.0)
+        proof = planner.prove(there_and_back)
+    finally:
+        planner.world.clear()
+    assert made.status is PlanStatus.INVALID_START and made.times["total"] < 5.0
+    assert made.reason == f"the motion of while_executing itself fails, {proof.reason}" and "wall" in made.reason
+
+
+def test_an_arm_that_is_at_its_goal_stays_or_makes_room(
+    planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]]
+) -> None:
+    stays = planner.plan("home", "home", group="left_arm", while_executing=there_and_back)
+    assert (
+        stays and stays.trajectory is not None and (stays.trajectory.positions[:, :7] == planner.robot.home[:7]).all()
+    )
+    values = dict(zip(planner.robot.joint_names, planner.robot.home.tolist(), strict=True))
+    start = {name: value for name, value in values.items() if "right_joint" not in name} | reached["left"]
+    room = planner.plan(start, reached["left"], group="left_arm", while_executing=there_and_back)
+    assert room and room.trajectory is not None and collisions(planner.robot, room.trajectory) == 0
+    left = room.trajectory.positions[:, :7]
+    assert np.array_equal(left[0], left[-1]) and np.ptp(left, axis=0).max() > 0.01
+
+
 def test_faulty_motions_are_refused_in_one_sentence(
     planner: MotionPlanner, there_and_back: Trajectory, reached: dict[str, dict[str, float]]
 ) -> None:
@@ -162,6 +194,7 @@ def test_faulty_motions_are_refused_in_one_sentence(
         ({"while_executing": there_and_back.before(0.2)}, "not at rest at its end"),
         ({"while_executing": there_and_back.after(0.2), "offset": -1.0}, "offset.*not at rest at its start"),
         ({"while_executing": there_and_back, "timing": False}, "timing.*True or a Timing"),
+        ({"while_executing": there_and_back, "leave_contact": 0.001}, "leave_contact: expected no contact to leave"),
         ({"offset": 0.1}, "offset: expected 0 without while_executing"),
     )
     for options, words in cases:

@@ -103,7 +103,9 @@ def test_an_edit_that_fails_changes_nothing(robot: Robot, tmp_path: Path) -> Non
         (SceneError, "no obstacle 'pots'", lambda: world.move("pots", (0, 0, 1))),
         (SceneError, "no obstacle 'pots'", lambda: world.remove("pots")),
         (SceneError, "no obstacle 'pots'", lambda: world.set_velocity("pots", (0, 0, 1))),
-        (SceneError, "no obstacle", lambda: world.remove(robot.fixtures[0].name)),
+        (SceneError, "fixture of the robot.*world.allow.*'remove'", lambda: world.remove(robot.fixtures[0].name)),
+        (SceneError, "fixture of the robot", lambda: world.move(robot.fixtures[0].name, (0.0, 0.0, 1.0))),
+        (SceneError, "fixture of the robot", lambda: world.attach(robot.fixtures[0].name, "torso", at=robot.home)),
         (SceneError, "no held object 'post'", lambda: world.detach("post")),
         (SceneError, "'post' is taken", lambda: world.add(name="post", sphere={"radius": 0.1})),
         (FileFormatError, "boks", lambda: world.add(name="b", boks=(1, 1, 1))),
@@ -185,6 +187,10 @@ def test_files_are_paths_or_content_from_memory_and_long_bodies_are_noted(robot:
         planner.world.add(name="floor", box=(100.0, 100.0, 0.1), position=(0.0, 0.0, -0.5))
         result = planner.plan("home", {**dict(zip(robot.joint_names, robot.home, strict=True)), "left_joint1": 0.1})
         assert "floor is 100 m long; lengths are meters" in result.notes
+        unread = {"file": "no_file.obj", "content": file.read_bytes(), "scale": (80.0, 80.0, 80.0)}
+        planner.world.add(name="far", mesh=unread, position=far)
+        planner.world.move("far", (0.0, 0.0, -200.0))
+        assert "far is 80 m long; lengths are meters" in planner.plan("home", "home").notes
     with pytest.raises(FileFormatError, match="mesh file ending in"):
         planner.world.add(name="odd", mesh=tmp_path / "cube.txt")
 

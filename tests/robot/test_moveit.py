@@ -117,6 +117,7 @@ def test_goals_of_the_wrong_form_are_errors(robot: Robot, tmp_path: Path) -> Non
         ("[1]", "goal_constraints.0: expected a mapping"),
         ("[{joint_constraints: [{joint_name: left_joint1, position: .inf}]}]", "0.position: expected a finite number"),
         ("[{joint_constraints: [{joint_name: left_joint1}]}]", "0.position: expected a finite number, got None"),
+        ("[{joint_constraints: [{joint_name: j1}]}]", "joint_constraints: expected joints of dual_.* map.*, got 'j1'"),
     ):
         with pytest.raises(FileFormatError, match=words):
             converted(tmp_path, robot, request=head + goals)
@@ -159,8 +160,9 @@ POSE_GOAL = """goal_constraints:
 
 def test_a_goal_of_positions_and_orientations_is_one_of_poses(robot: Robot, tmp_path: Path) -> None:
     head = REQUEST.split("goal_constraints")[0]
-    goal = converted(tmp_path, robot, request=head + POSE_GOAL).problem.goal
-    assert goal.poses is not None
+    done = converted(tmp_path, robot, request=head + POSE_GOAL)
+    goal = done.problem.goal
+    assert goal.poses is not None and any("palm: its tolerances differ" in note for note in done.notes)
     (pose,) = goal.poses
     assert (pose.frame, pose.position) == ("left_hand_palm", (0.5, 0.2, 0.6))
     np.testing.assert_allclose(np.abs(pose.orientation), (1.0, 0.0, 0.0, 0.0), atol=1e-12)
@@ -173,6 +175,8 @@ def test_a_goal_of_positions_and_orientations_is_one_of_poses(robot: Robot, tmp_
         (("type: 2, dimensions: [0.002]", "type: 1, dimensions: [1, 1, 1]"), None),
         (("link_name: palm\n        orientation", "link_name: left_link5\n        orientation"), "a position for each"),
         (("link_name: palm", "link_name: nose"), "expected a link of"),
+        (("tolerance: 0.04", "tolerance: 0"), "orientation_constraints of palm: expected three tolerances"),
+        (("tolerance: 0.04", "tolerance: -1"), "orientation_constraints of palm: expected three tolerances"),
     ):
         changed = head + POSE_GOAL.replace(*change)
         if word is None:
