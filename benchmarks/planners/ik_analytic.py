@@ -6,7 +6,7 @@ the redundant joint (``solve``), or gives each self-motion as a curve, of which 
 states are checked for collision by the planner's checker, whose time counts as well. For the nearest state, ``solve``
 ranks by the distance from home, and the first free one is taken. Times are those of the process.
 
-Usage: python -m benchmarks.planners.ik_analytic [-n 500] [--split test]    (needs the extra "peers")
+Usage: python -m benchmarks.planners.ik_analytic [-n 300] [--split test]    (needs the extra "peers")
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def tables(runs: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Examine targets, and write the results."""
-    parser = record.parser(__doc__ or "", n=500, of="targets")
+    parser = record.parser(__doc__ or "", n=300, of="targets")
     parser.add_argument("--split", default="test", choices=SEEDS)
     given = parser.parse_args()
     with MotionPlanner(ROBOT) as planner:
