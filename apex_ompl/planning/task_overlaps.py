@@ -1,17 +1,19 @@
 """Steps of a task at the same time: each arm goes on as soon as what it needs is done.
 
 A task is planned one step after the other. Here its steps, in that order, are moved to the earliest time at which they
-can start: after the steps before them of the same arms, or that hold or change the same objects, and where all that
-goes on at once then is proved, in the world as it is at each time (sequential plans are executed so by APEX-MR, Huang
-et al. 2025). A step that fits nowhere before starts when all others have ended, as it was planned. Steps of the scene,
-and waits, are for all arms.
+can start: after the steps before them of the same arms, or that hold, change or still touch the same objects, and where
+all that goes on at once then is proved, in the world as it is at each time (sequential plans are executed so by
+APEX-MR, Huang et al. 2025). A step that fits nowhere before starts when all others have ended, as it was planned. Steps
+of the scene, and waits, are for all arms.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from math import isnan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -79,6 +81,7 @@ class Interval:
         start: When it starts [s].
         end: When it ends [s].
         steps: What goes on.
+        ending: Steps that change the world at its end; of the first interval those at its start, too.
         world: The world.
         after: The world after it.
         motion: All motion in it.
@@ -88,6 +91,7 @@ class Interval:
     start: float
     end: float
     steps: tuple[PlacedStep, ...]
+    ending: tuple[PlacedStep, ...]
     world: TaskWorld
     after: TaskWorld
     motion: Trajectory
@@ -101,8 +105,7 @@ class Interval:
     @property
     def changed(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Objects that are let go of at its end, and those that are taken."""
-        ending = [one.plan.step for one in self.steps if abs(one.done - self.end) <= SAME]
-        pairs = [changes(step, self.world) for step in ending]
+        pairs = [changes(one.plan.step, one.plan.world) for one in self.ending]
         return tuple(n for released, _ in pairs for n in released), tuple(n for _, grasped in pairs for n in grasped)
 
 
@@ -166,8 +169,7 @@ def overlapped(planner: StepPlanner, plans: Sequence[StepPlan]) -> list[PlacedSt
     placed, first = list[PlacedStep](), plans[0].world
     needs = [_needs(planner.robot, plan) for plan in plans]
     for k, plan in enumerate(plans):
-        mine = needs[k]
-        waited = [one.end for one, its in zip(placed, needs, strict=False) if mine is None or its is None or mine & its]
+        waited = [_free_at(one, its, needs[k]) for one, its in zip(placed, needs, strict=False)]
         earliest, last = max(waited, default=0.0), max((one.end for one in placed), default=0.0)
         for start in (*_starts(placed, earliest, last), last):
             if planner.ended:
@@ -190,7 +192,7 @@ def proved(planner: StepPlanner, placed: Sequence[PlacedStep]) -> list[Interval]
         clearance = _clearance(planner, one)
         if clearance is None:
             raise StepFailed(f"{one.title} cannot be done at once")
-        found.append(Interval(one.start, one.end, one.steps, one.world, one.after, one.motion, clearance))
+        found.append(replace(one, clearance=clearance))
     return found
 
 
@@ -223,13 +225,15 @@ def _intervals(world: TaskWorld, placed: Sequence[PlacedStep], since: float) -> 
     )
     times = sorted({time for time, *_ in events} | {one.end for one in placed})
     times = [time for k, time in enumerate(times) if not k or time - times[k - 1] > SAME]
-    for start, end in zip(times, times[1:], strict=False):
+    for start, end in pairwise(times):
         world = _changed(world, placed, motion, [one for one in events if one[0] <= start + SAME])
         events = [one for one in events if one[0] > start + SAME]
         if end > since + SAME:
             going = tuple(one for one in placed if one.start < end - SAME and one.end > start + SAME)
             after = _changed(world, placed, motion, [one for one in events if one[0] <= end + SAME])
-            yield Interval(start, end, going, world, after, motion.before(end).after(start), float("nan"))
+            begin = start + SAME if start > times[0] else -np.inf
+            ending = tuple(one for one in placed if begin < one.done <= end + SAME)
+            yield Interval(start, end, going, ending, world, after, motion.before(end).after(start), float("nan"))
 
 
 def _changed(
@@ -269,23 +273,43 @@ def joints_needed(robot: Robot, start: Array, goals: Sequence[Array]) -> list[st
     return [robot.joint_names[k] for k in sorted(joints)]
 
 
-def _needs(robot: Robot, plan: StepPlan) -> frozenset[str] | None:
-    """Return the hands and objects that a step needs for itself, or None where it needs all."""
+class _Needs(NamedTuple):
+    """What a step needs for itself.
+
+    Attributes:
+        hands: Hands that it moves, opens or closes.
+        objects: Objects that these hold, take, let go of, or still touch.
+    """
+
+    hands: frozenset[str]
+    objects: frozenset[str]
+
+
+def _free_at(one: PlacedStep, its: _Needs | None, mine: _Needs | None) -> float:
+    """Return the time from which on a step leaves free what another one needs [s]; None needs all."""
+    if its is None or mine is None or its.hands & mine.hands:
+        return one.end
+    return one.done if its.objects & mine.objects else 0.0
+
+
+def _needs(robot: Robot, plan: StepPlan) -> _Needs | None:
+    """Return what a step needs for itself, or None where it needs all."""
     step, moved = plan.step, set(np.flatnonzero((plan.path.states != plan.path.states[0]).any(axis=0)).tolist())
     parts = step.steps if isinstance(step, TogetherStep) else (step,)
     if any(isinstance(one, WaitStep | SceneStep) for one in parts):
         return None
     detached = {plan.world.holder(one.object) for one in parts if isinstance(one, DetachStep)}
-    if None in detached:
+    fixed = [one for one in parts if isinstance(one, AttachStep) and one.link not in robot.hands]
+    hands = {
+        name for name, joints in joints_of_hands(robot).items()
+        if joints & moved or name in detached
+        or any(name in (getattr(one, "hand", None), getattr(one, "link", None)) for one in parts)
+    }  # fmt: skip
+    if not hands or fixed or None in detached:
         return None
-    hands = set[str]()
-    for name, joints in joints_of_hands(robot).items():
-        named = any(name in (getattr(one, "hand", None), getattr(one, "link", None)) for one in parts)
-        if joints & moved or named or name in detached:
-            hands.add(name)
-    if not hands or any(isinstance(one, AttachStep) and one.link not in robot.hands for one in parts):
-        return None
-    objects = {name for hand in hands for world in (plan.world, plan.after) for name in world.held_by(hand)}
+    worlds, objects = (plan.world, plan.after), set[str]()
+    for hand in hands:
+        objects.update(*(world.held_by(hand) for world in worlds), *(world.leaving.get(hand, ()) for world in worlds))
     for one in parts:
         objects.update(*changes(one, plan.world))
-    return frozenset(hands | objects)
+    return _Needs(frozenset(hands), frozenset(objects))

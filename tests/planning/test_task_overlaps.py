@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,9 @@ from apex_ompl.physics import execute
 from apex_ompl.planning import TaskSearch, task_overlaps
 from apex_ompl.planning.task_motion import task_fault
 from apex_ompl.planning.task_overlaps import PlacedStep, overlapped
+from apex_ompl.planning.task_steps import StepPlan, StepPlanner
 from apex_ompl.problems import cells
+from apex_ompl.scene.steps import RetreatStep
 
 SECONDS = 60.0
 AT_ONCE = TaskSearch(asynchronous=True)
@@ -78,6 +81,27 @@ def test_each_arm_has_the_motions_that_were_planned_at_other_times(monkeypatch: 
         assert np.allclose(shifts[0][:, moved], shifts[1][:, moved], atol=1e-9), one.plan.step.title
 
 
+def test_no_object_is_moved_while_a_hand_that_leaves_it_may_touch_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Contact of a hand and what it released is allowed until then, and would not be seen."""
+    placed, late = list[PlacedStep](), 0.15
+
+    def kept(planner: StepPlanner, plans: list[StepPlan]) -> list[PlacedStep]:
+        touching = [replace(one, left=late) if isinstance(one.step, RetreatStep) else one for one in plans]
+        placed.extend(overlapped(planner, touching))
+        return placed
+
+    monkeypatch.setattr(task_overlaps, "overlapped", kept)
+    cell = cells.draw("handover", 2003)
+    with MotionPlanner(cell.robot) as planner:
+        assert planner.plan_task(cell, timeout=SECONDS, seed=2003, search=AT_ONCE)
+    retreat = next(
+        one for one in placed if isinstance(one.plan.step, RetreatStep) and one.plan.step.hand == "left_hand"
+    )
+    moves = next(one for one in placed if one.plan.step.title == "move bar")
+    assert retreat.plan.world.leaving == {"left_hand": ("bar",)} and retreat.motion.duration > 2.0 * late
+    assert retreat.start + late - 1e-9 <= moves.start < retreat.end
+
+
 def test_an_arm_brings_a_box_while_the_other_one_puts_its_own_down() -> None:
     first, result = made("stacking", 2001, False), made("stacking", 2001, True)
     motion = result.trajectory
@@ -109,7 +133,8 @@ def test_two_arms_with_boxes_of_their_own_take_half_of_the_time() -> None:
     assert one and both and one.trajectory is not None and both.trajectory is not None
     assert both.trajectory.duration < 0.6 * one.trajectory.duration
     assert not task_fault(both, both.trajectory)
-    assert {name for step in both.steps for name in step.grasped} <= {"left_box", "right_box"}
+    for name in ("grasped", "released"):
+        assert sorted(body for step in both.steps for body in getattr(step, name)) == ["left_box", "right_box"]
     ends = {body.name: body.position for body in both.steps[-1].scene}
     assert all(np.allclose(ends[body.name], body.position, atol=1e-6) for body in one.steps[-1].scene)
     assert waiting and waiting.trajectory is not None
