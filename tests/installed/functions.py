@@ -174,6 +174,7 @@ def _use_tasks() -> None:
     assert task.object_poses(robot, task.goal_time)["upper"] is not None
     task.save("task.npz")
     assert apex_ompl.TaskResult.load("task.npz").as_dict() == task.as_dict()
+    assert len(apex_ompl.TaskResult.of_motion(task).steps) == 1
     with apex_ompl.MotionPlanner(robot) as planner:
         assert planner.plan_task(apex_ompl.load_problem("handover"), timeout=20.0)
     with apex_ompl.MotionPlanner("panda") as planner:
