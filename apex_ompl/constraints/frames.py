@@ -82,6 +82,16 @@ class LinkFace:
         return cls(hand.palm, np.asarray(hand.point, float), np.asarray(hand.axis, float))
 
 
+def holding_link(robot: Robot, name: str) -> str:
+    """Return the link that holds what a hand or a link takes: the palm of the hand, or the link itself."""
+    return robot.hands[name].palm if name in robot.hands else name
+
+
+def holding_hand(robot: Robot, link: str) -> str | None:
+    """Return the hand that a link belongs to, or None."""
+    return next((name for name, hand in robot.hands.items() if link in robot.hand_of(hand.palm)), None)
+
+
 def frame_of(robot: Robot, name: str, held: Mapping[str, AttachedObject], role: str = "frame") -> Frame:
     """Return the frame of a hand, a link or a held object by name.
 

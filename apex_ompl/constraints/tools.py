@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.arrays import FIXED, PRISMATIC
 from apex_ompl.kernel.products import product
-from apex_ompl.kernel.tool_poses import DAMPING, LEAST_PIVOT, LEAST_SQUARE, ToolSolver
+from apex_ompl.kernel.tool_poses import DAMPING, LEAST_SQUARE, ToolSolver
 from apex_ompl.types import Array, Flags
 
+LEAST_PIVOT = 1e-14
 NULL = 1e-6  # least square of a column of the projector, for there to be a null space
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.constraints.frames import holding_hand
 from apex_ompl.drivers.jaws import RIGID
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.twin_settings import TwinSettings
@@ -226,11 +227,8 @@ def hands_of(robot: Robot, held: AttachedObject) -> tuple[str, ...]:
 
 def holder_of(robot: Robot, held: AttachedObject) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the hand that a step ``detach`` frees an object from, if any, and the links of it, or the only link."""
-    for name, hand in robot.hands.items():
-        links = robot.hand_of(hand.palm)
-        if held.link in links:
-            return (name,), links
-    return (), (held.link,)
+    name = holding_hand(robot, held.link)
+    return ((), (held.link,)) if name is None else ((name,), robot.hand_of(robot.hands[name].palm))
 
 
 def in_link(driver: MujocoDriver, name: str, link: str) -> Array:

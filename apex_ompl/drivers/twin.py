@@ -24,6 +24,7 @@ import pinocchio as pin
 
 from apex_ompl.collision.mass import held_load
 from apex_ompl.collision.shapes import coal_geometry
+from apex_ompl.constraints.frames import holding_link
 from apex_ompl.drivers.geoms import geom_shapes
 from apex_ompl.drivers.jaws import RIGID, add_jaws, set_jaws
 from apex_ompl.drivers.library import mujoco
@@ -38,7 +39,6 @@ from apex_ompl.drivers.twin_settings import (
     mimic_joints,
     payloads,
     servo_gains,
-    taking_link,
     with_mass,
 )
 from apex_ompl.errors import RobotError
@@ -137,7 +137,7 @@ class Twin:
         palms = [hand.palm for hand in self.robot.hands.values()]
         steps = parts(self.problem.after) if self.problem else ()
         taking = [one for one in steps if isinstance(one, AttachStep) and one.object == held.name]
-        links = (held.link, *palms, *(taking_link(self.robot, one) for one in taking))
+        links = (held.link, *palms, *(holding_link(self.robot, one.link) for one in taking))
         return () if held.touch_links == () else tuple(dict.fromkeys(links))
 
     def weld(self, data: Any, name: str, link: str, active: bool = True) -> None:

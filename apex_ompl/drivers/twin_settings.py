@@ -17,7 +17,6 @@ from apex_ompl.robot.dynamics import Load
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import AttachStep, TakingStep
 from apex_ompl.util.validation import check_number, check_positive, finite_numbers
 
 PANDA_EFFORT = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # by which the joints of a Panda are known [Nm]
@@ -131,12 +130,6 @@ def held_loads(robot: Robot, problem: Problem, settings: TwinSettings) -> tuple[
     """Return the masses that the robot holds in a problem: held objects and the payload."""
     loads = (held_load(with_mass(held, settings.density)) for held in problem.attached)
     return (*(load for load in loads if load is not None), *payloads(robot, problem))
-
-
-def taking_link(robot: Robot, step: TakingStep) -> str:
-    """Return the link that holds the object of a step after it: a palm, or the link that it is attached to."""
-    taker = step.link if isinstance(step, AttachStep) else step.hand
-    return robot.hands[taker].palm if taker in robot.hands else taker
 
 
 def servo_gains(robot: Robot, settings: TwinSettings) -> dict[str, tuple[float, float]]:

@@ -11,7 +11,6 @@ from apex_ompl.errors import ParameterError
 from apex_ompl.kernel.compiled.layout import Floats, Integers, pack
 from apex_ompl.kernel.compiled.robot.tool_poses import (
     DAMPING,
-    LEAST_PIVOT,
     LEAST_SQUARE,
     ToolArrays,
     close_tools,
@@ -23,7 +22,7 @@ from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import compact
 from apex_ompl.util.validation import check_indices, shape_error
 
-__all__ = ["DAMPING", "LEAST_PIVOT", "LEAST_SQUARE", "ToolSolver"]
+__all__ = ["DAMPING", "LEAST_SQUARE", "ToolSolver"]
 
 
 class ToolSolver:

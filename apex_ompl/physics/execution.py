@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from apex_ompl.constraints.frames import holding_link
 from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, holder_of, in_link, turned
 from apex_ompl.drivers.mujoco import MujocoDriver
-from apex_ompl.drivers.twin_settings import TwinSettings, taking_link
+from apex_ompl.drivers.twin_settings import TwinSettings
 from apex_ompl.drivers.vessels import filled
 from apex_ompl.physics.judges import Check, Intended, Judge
 from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun
@@ -180,7 +181,7 @@ class Executor:
             if isinstance(one, GraspStep):
                 self.grasps.grasp(one.object, one.hand, self._to)
             if isinstance(one, AttachStep):
-                self.grasps.attach(one.object, taking_link(self.robot, one))
+                self.grasps.attach(one.object, holding_link(self.robot, one.link))
             if isinstance(one, DetachStep):
                 others = [k for k in planned.attached if k.name != one.object and k.touch_links != ()]
                 busy = {hand for other in others for hand in hands_of(self.robot, other)}

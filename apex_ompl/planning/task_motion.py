@@ -13,7 +13,7 @@ from apex_ompl.collision import CollisionChecker
 from apex_ompl.constraints.links import Links
 from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.task_result import GOAL, TaskResult, TaskStep
-from apex_ompl.planning.task_steps import StepPlan, StepPlanner, timing_in
+from apex_ompl.planning.task_steps import StepPlan, StepPlanner, most_used, timing_in
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
@@ -84,9 +84,8 @@ def whole(
         return result
     motion = _through(motions, starts, [one is not None for one in blends])
     uses = [found.limit_use, *(plan.use for plan in plans), *(one.use for one in blends if one is not None)]
-    use = {name: max(one.get(name, 0.0) for one in uses) for name in dict.fromkeys(n for one in uses for n in one)}
     return replace(
-        result, trajectory=motion, limit_use=use | dict(motion.use(planner.robot.limits)),
+        result, trajectory=motion, limit_use=most_used(uses) | dict(motion.use(planner.robot.limits)),
         motion_clearance=min(step.clearance for step in steps), deviation=max(plan.deviation for plan in plans),
     )  # fmt: skip
 

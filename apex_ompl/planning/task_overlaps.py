@@ -3,13 +3,13 @@
 A task is planned one step after the other. Here its steps, in that order, are moved to the earliest time at which they
 can start: after the steps before them of the same arms, or that hold, change or still touch the same objects, and where
 all that goes on at once then is proved, in the world as it is at each time (sequential plans are executed so by
-APEX-MR, Huang et al. 2025). A step that fits nowhere before starts when all others have ended, as it was planned. Steps
-of the scene, and waits, are for all arms.
+APEX-MR, Huang et al. 2025). A step that fits nowhere before starts when all others have ended, as it was planned. The
+motion to the goal, steps of the scene, and waits are for all arms.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import isnan
@@ -17,24 +17,28 @@ from typing import NamedTuple
 
 import numpy as np
 
+from apex_ompl.constraints.frames import holding_link
 from apex_ompl.constraints.links import Links
-from apex_ompl.ompl.validity import full_check
+from apex_ompl.errors import RobotError
+from apex_ompl.goals.arms import Arm, arms_of
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.task_motion import changes
-from apex_ompl.planning.task_result import AT_ONCE, GOAL, TaskResult, TaskStep
-from apex_ompl.planning.task_steps import StepPlan, StepPlanner
+from apex_ompl.planning.task_result import AT_ONCE, TaskResult, TaskStep
+from apex_ompl.planning.task_steps import StepPlan, StepPlanner, most_used
 from apex_ompl.planning.task_waypoints import LATE, StepFailed
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
-from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.steps import (
     AttachStep,
     DetachStep,
+    HandedStep,
+    RetreatStep,
     SceneStep,
+    Step,
     TakingStep,
-    TogetherStep,
     WaitStep,
+    parts,
 )
 from apex_ompl.timing import Trajectory
 from apex_ompl.timing.combination import superposed
@@ -97,63 +101,53 @@ class Interval:
     motion: Trajectory
     clearance: float
 
-    @property
-    def title(self) -> str:
-        """The titles of what goes on."""
-        return " + ".join(one.plan.step.title for one in self.steps) or "rest"
-
-    @property
-    def changed(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Objects that are let go of at its end, and those that are taken."""
+    def recorded(self) -> TaskStep:
+        """Return it as a step of a result."""
+        kind = self.steps[0].plan.step.kind if len(self.steps) == 1 else AT_ONCE
+        title = " + ".join(one.plan.step.title for one in self.steps) or "rest"
         pairs = [changes(one.plan.step, one.plan.world) for one in self.ending]
-        return tuple(n for released, _ in pairs for n in released), tuple(n for _, grasped in pairs for n in grasped)
+        released, grasped = (tuple(name for pair in pairs for name in pair[k]) for k in range(2))
+        gone = tuple(name for name in released if name not in self.after.scene and name not in self.after.held)
+        return TaskStep(
+            kind, title, self.start, self.end, Path(self.motion.positions), self.clearance,
+            tuple(self.world.scene.values()), tuple(self.world.held.values()), tuple(sorted(self.world.pairs)),
+            released=released, grasped=grasped, gone=gone,
+        )  # fmt: skip
 
 
 def whole_at_once(
-    planner: StepPlanner, found: PlanResult, plans: Sequence[StepPlan], problem: Problem
-) -> TaskResult | None:  # fmt: skip
-    """Return the result of a task whose steps start as early as they can, or None where no time is left for that.
+    planner: StepPlanner, made: TaskResult, found: PlanResult, plans: Sequence[StepPlan]
+) -> TaskResult:  # fmt: skip
+    """Return the result of a task whose steps start as early as they can, or the given one where that is not shorter.
 
-    Its steps are the times between events.
+    After the motion to the goal, which is done alone, its steps are the times between events.
 
     Args:
         planner: Planner of its steps.
+        made: The result with one step after the other, timed.
         found: The plan to its goal.
         plans: The timed plans of all steps, the motion to the goal first.
-        problem: The problem.
     """
+    assert made.trajectory is not None
     try:
         placed = overlapped(planner, plans)
-        intervals = proved(planner, placed)
-    except StepFailed:
-        return None
-    motion, steps = whole_motion(placed), list[TaskStep]()
-    for one in intervals:
-        released, grasped = one.changed
-        gone = tuple(name for name in released if name not in one.after.scene and name not in one.after.held)
-        steps.append(TaskStep(
-            one.steps[0].plan.step.kind if len(one.steps) == 1 else AT_ONCE, one.title, one.start, one.end,
-            Path(one.motion.positions), one.clearance, tuple(one.world.scene.values()),
-            tuple(one.world.held.values()), tuple(sorted(one.world.pairs)), released=released, grasped=grasped,
-            gone=gone,
-        ))  # fmt: skip
-    steps[0] = replace(
-        steps[0], kind=GOAL, title=GOAL if len(placed) == 1 else steps[0].title, scene=problem.scene,
-        attached=problem.attached, allowed=problem.allowed,
-    )  # fmt: skip
-    uses = [found.limit_use, *(plan.use for plan in plans)]
-    use = {name: max(one.get(name, 0.0) for one in uses) for name in dict.fromkeys(n for one in uses for n in one)}
+        motion = whole_motion(placed)
+        if motion.duration >= made.trajectory.duration:
+            return made
+        times = proved(planner, placed)
+    except StepFailed:  # no time is left
+        return made
+    goal, steps = made.steps[0], [one.recorded() for one in times]
+    goal = replace(goal, end=placed[0].end, clearance=plans[0].clearance, blended=False)
+    if goal.end > SAME:
+        first = steps.pop(0)
+        goal = replace(goal, released=first.released, grasped=first.grasped, gone=first.gone)
+    steps.insert(0, goal)
+    uses = most_used([found.limit_use, *(plan.use for plan in plans)])
     return replace(
-        TaskResult.of(found), steps=tuple(steps), trajectory=motion,
-        limit_use=use | dict(motion.use(planner.robot.limits)),
-        motion_clearance=min(step.clearance for step in steps), deviation=max(plan.deviation for plan in plans),
+        made, steps=tuple(steps), trajectory=motion, limit_use=uses | dict(motion.use(planner.robot.limits)),
+        motion_clearance=min(step.clearance for step in steps), notes=found.notes,
     )  # fmt: skip
-
-
-def shorter(first: TaskResult, second: TaskResult) -> bool:
-    """Whether one result has a shorter motion than another one."""
-    assert first.trajectory is not None and second.trajectory is not None
-    return first.trajectory.duration < second.trajectory.duration
 
 
 def overlapped(planner: StepPlanner, plans: Sequence[StepPlan]) -> list[PlacedStep]:
@@ -161,21 +155,21 @@ def overlapped(planner: StepPlanner, plans: Sequence[StepPlan]) -> list[PlacedSt
 
     Args:
         planner: Planner of the steps; its checker is used.
-        plans: The timed steps in their order.
+        plans: The timed steps in their order, the motion to the goal first.
 
     Raises:
         StepFailed: No time is left.
     """
     placed, first = list[PlacedStep](), plans[0].world
-    needs = [_needs(planner.robot, plan) for plan in plans]
+    needs = [None, *(_needs(planner.robot, plan) for plan in plans[1:])]
     for k, plan in enumerate(plans):
         waited = [_free_at(one, its, needs[k]) for one, its in zip(placed, needs, strict=False)]
         earliest, last = max(waited, default=0.0), max((one.end for one in placed), default=0.0)
         for start in (*_starts(placed, earliest, last), last):
-            if planner.ended:
+            if planner.ends():
                 raise StepFailed(LATE)
             trial = [*placed, PlacedStep(plan, start)]
-            if start >= last or all(_clearance(planner, one) is not None for one in _intervals(first, trial, start)):
+            if start >= last or _is_free(planner, _intervals(first, trial, start)):
                 placed = trial
                 break
     return placed
@@ -185,15 +179,10 @@ def proved(planner: StepPlanner, placed: Sequence[PlacedStep]) -> list[Interval]
     """Return the times between the events of steps, each proved.
 
     Raises:
-        StepFailed: One is not free.
+        StepFailed: One is not free, or no time is left.
     """
-    found = list[Interval]()
-    for one in _intervals(placed[0].plan.world, placed, 0.0):
-        clearance = _clearance(planner, one)
-        if clearance is None:
-            raise StepFailed(f"{one.title} cannot be done at once")
-        found.append(replace(one, clearance=clearance))
-    return found
+    times = _intervals(placed[0].plan.world, placed, 0.0)
+    return [replace(one, clearance=planner.proved(one.world, one.motion).clearance) for one in times]
 
 
 def whole_motion(placed: Sequence[PlacedStep]) -> Trajectory:
@@ -210,11 +199,14 @@ def _starts(placed: Sequence[PlacedStep], earliest: float, last: float) -> list[
     return sorted(events | parts)
 
 
-def _clearance(planner: StepPlanner, interval: Interval) -> float | None:
-    """Return the least distance of a checked pair in an interval [m], or None where it is not free."""
-    planner.become(interval.world)
-    check = full_check(planner.checker, interval.motion)
-    return check.proof.clearance if check and check.proof is not None else None
+def _is_free(planner: StepPlanner, times: Iterable[Interval]) -> bool:
+    """Whether all that goes on in some times is free."""
+    try:
+        for one in times:
+            planner.proved(one.world, one.motion)
+    except StepFailed:
+        return False
+    return True
 
 
 def _intervals(world: TaskWorld, placed: Sequence[PlacedStep], since: float) -> Iterator[Interval]:
@@ -241,75 +233,88 @@ def _changed(
 ) -> TaskWorld:
     """Return the world after events: objects are taken when a step starts, and let go of when it is done."""
     for time, k, done in sorted(events, key=lambda event: (event[1], event[2])):
-        step = placed[k].plan.step
-        for one in step.steps if isinstance(step, TogetherStep) else (step,):
+        for one in parts([placed[k].plan.step]):
             if done != isinstance(one, TakingStep):
                 world = world.after(one, motion(min(time, motion.duration)))
     return world
 
 
-def joints_of_hands(robot: Robot) -> dict[str, set[int]]:
-    """Return the numbers of the planned joints of each hand: those that move its palm, and its own."""
-    links, found = Links.of(robot), dict[str, set[int]]()
-    for name, hand in robot.hands.items():
-        found[name] = {*links.moved(links.point(hand.palm, np.zeros(3)).joint)}
-        if hand.synergy is not None:
-            found[name].add(robot.joint_names.index(hand.synergy))
-    return found
-
-
 def joints_needed(robot: Robot, start: Array, goals: Sequence[Array]) -> list[str] | None:
-    """Return names of the joints of the hands that move from a start to goals, or None where all joints are needed.
+    """Return names of the joints of the arms that move from a start to goals, or None where all joints are needed.
 
     Args:
         robot: The robot.
         start: The start, shape (dof,).
         goals: The goals, shape (dof,) each.
     """
-    moved = set(np.flatnonzero((np.array(goals) != start).any(axis=0)).tolist())
-    joints = set[int]().union(*(mine for mine in joints_of_hands(robot).values() if mine & moved))
-    if not moved or not moved <= joints or len(joints) == robot.dof:
-        return None
-    return [robot.joint_names[k] for k in sorted(joints)]
+    arms = _arms_with(robot, set(np.flatnonzero((np.array(goals) != start).any(axis=0)).tolist()))
+    joints = set[int]().union(*(arm.joints for arm in arms or ()))
+    return None if not arms or len(joints) == robot.dof else [robot.joint_names[k] for k in sorted(joints)]
 
 
 class _Needs(NamedTuple):
     """What a step needs for itself.
 
     Attributes:
-        hands: Hands that it moves, opens or closes.
+        arms: Names of the arms that it moves, or whose hands it opens or closes.
         objects: Objects that these hold, take, let go of, or still touch.
     """
 
-    hands: frozenset[str]
+    arms: frozenset[str]
     objects: frozenset[str]
 
 
 def _free_at(one: PlacedStep, its: _Needs | None, mine: _Needs | None) -> float:
     """Return the time from which on a step leaves free what another one needs [s]; None needs all."""
-    if its is None or mine is None or its.hands & mine.hands:
+    if its is None or mine is None or its.arms & mine.arms:
         return one.end
     return one.done if its.objects & mine.objects else 0.0
 
 
 def _needs(robot: Robot, plan: StepPlan) -> _Needs | None:
     """Return what a step needs for itself, or None where it needs all."""
-    step, moved = plan.step, set(np.flatnonzero((plan.path.states != plan.path.states[0]).any(axis=0)).tolist())
-    parts = step.steps if isinstance(step, TogetherStep) else (step,)
-    if any(isinstance(one, WaitStep | SceneStep) for one in parts):
+    steps, states = parts([plan.step]), plan.path.states
+    if any(isinstance(one, WaitStep | SceneStep) for one in steps):
         return None
-    detached = {plan.world.holder(one.object) for one in parts if isinstance(one, DetachStep)}
-    fixed = [one for one in parts if isinstance(one, AttachStep) and one.link not in robot.hands]
-    hands = {
-        name for name, joints in joints_of_hands(robot).items()
-        if joints & moved or name in detached
-        or any(name in (getattr(one, "hand", None), getattr(one, "link", None)) for one in parts)
-    }  # fmt: skip
-    if not hands or fixed or None in detached:
+    moved = set(np.flatnonzero((states != states[0]).any(axis=0)).tolist())
+    links = [_link_of(robot, one, plan.world) for one in steps]
+    arms = _arms_with(robot, moved, [link for link in links if link is not None])
+    if not arms:
         return None
-    worlds, objects = (plan.world, plan.after), set[str]()
-    for hand in hands:
-        objects.update(*(world.held_by(hand) for world in worlds), *(world.leaving.get(hand, ()) for world in worlds))
-    for one in parts:
-        objects.update(*changes(one, plan.world))
-    return _Needs(frozenset(hands), frozenset(objects))
+    mine, objects = set[int]().union(*(arm.joints for arm in arms)), set[str]()
+    for world in (plan.world, plan.after):
+        objects.update(
+            name for name, held in world.held.items() if any(_above(robot, link) & mine for link in held.holders)
+        )
+        left = world.leaving.items()
+        objects.update(n for hand, names in left if _above(robot, robot.hands[hand].palm) & mine for n in names)
+    objects.update(*(name for one in steps for name in changes(one, plan.world)))
+    return _Needs(frozenset(arm.name for arm in arms), frozenset(objects))
+
+
+def _link_of(robot: Robot, step: Step, world: TaskWorld) -> str | None:
+    """Return the link whose hand a step moves, or that takes or leaves an object; None of other steps."""
+    if isinstance(step, DetachStep):
+        return world.held[step.object].link
+    if isinstance(step, AttachStep):
+        return holding_link(robot, step.link)
+    return robot.hands[step.hand].palm if isinstance(step, HandedStep | RetreatStep) else None
+
+
+def _arms_with(robot: Robot, moved: set[int], links: Sequence[str] = ()) -> list[Arm] | None:
+    """Return the arms that have some joints or links, or None where one is of no arm."""
+    try:
+        arms = arms_of(robot)
+    except RobotError:  # it has none
+        return None
+    above = [_above(robot, link) for link in links]
+    of_arms = set[int]().union(*(arm.joints for arm in arms))
+    if not moved <= of_arms or not all(joints & of_arms for joints in above):
+        return None
+    return [arm for arm in arms if {*arm.joints} & moved.union(*above)]
+
+
+def _above(robot: Robot, link: str) -> set[int]:
+    """Return the planned joints that move a link."""
+    links = Links.of(robot)
+    return {*links.moved(links.point(link, np.zeros(3)).joint)}

@@ -18,12 +18,11 @@ from apex_ompl.constraints.line_tracking import LineTracker, Track
 from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.goal_sampling import sample
 from apex_ompl.ompl.setup import state_fault
-from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.query import Group
 from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_goals import TaskGoal, task_goal
 from apex_ompl.planning.task_steps import StepPlanner
-from apex_ompl.planning.task_waypoints import StepFailed, checked
+from apex_ompl.planning.task_waypoints import StepFailed
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
 from apex_ompl.scene.steps import BodiesStep, DetachStep, GraspStep, HandedStep, StraightStep, TogetherStep
@@ -120,15 +119,6 @@ class Rehearsal:
             self._reasons[k] = query_fault(setup)[1] or UNREACHED
         return StepFailed(self._reasons[k], UNREACHED)
 
-    def _check(self, world: TaskWorld, q: Array) -> None:
-        """Check that a state, shape (dof,), is free in a world.
-
-        Raises:
-            StepFailed: It is not.
-        """
-        self.planner.become(world)
-        checked(self.planner.checker, full_check(self.planner.checker, q[None]))
-
     def _goals(self, k: int, world: TaskWorld, q: Array) -> Array:
         """Return a few free states that reach the goal of a stage from a state, shape (N, dof)."""
         move = self.stages[k].move
@@ -156,11 +146,11 @@ class Rehearsal:
         if isinstance(step, HandedStep):
             during = world.grasped(step, q) if isinstance(step, GraspStep) else world
             end = self.planner.hand_end(during, step, q)
-            self._check(during, end)
+            self.planner.proved(during, end[None])
             return world.after(step, end), end
         if isinstance(step, BodiesStep):
             after = world.after(step, q)
-            self._check(world if isinstance(step, DetachStep) else after, q)
+            self.planner.proved(world if isinstance(step, DetachStep) else after, q[None])
             return after, q
         if isinstance(step, TogetherStep):
             ends = [self._step(one, world, q)[1] for one in step.steps]

@@ -22,8 +22,9 @@ from apex_ompl.util.schema import StrictModel, read_json, read_yaml, validate
 from apex_ompl.util.validation import finite_array
 
 GOAL = "goal"
-AT_ONCE = "at once"  # kind of what several arms do
 """Kind of the first step, the motion to the goal."""
+AT_ONCE = "at once"
+"""Kind of what several arms do."""
 
 
 class _Bodies(StrictModel):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import isnan, nan
@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.constraints.line import SAME_POINT
 from apex_ompl.constraints.line_ends import LineEnd
 from apex_ompl.errors import SceneError, TimingError
@@ -20,7 +21,7 @@ from apex_ompl.paths.path import Path, abreast
 from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
 from apex_ompl.planning.task_constraints import StepConstraints
-from apex_ompl.planning.task_waypoints import LATE, StepFailed, check_near, checked, held_pose, waypoints
+from apex_ompl.planning.task_waypoints import LATE, StepFailed, check_near, held_pose, waypoints
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
@@ -100,13 +101,9 @@ class StepPlanner:
         self._constraints = StepConstraints(checker.robot, problem)
         self._deadline, self._pressed = deadline, pressed
 
-    def _ends(self) -> bool:
-        return self._pressed() or self._deadline.expired
-
-    @property
-    def ended(self) -> bool:
+    def ends(self) -> bool:
         """Whether no time is left."""
-        return self._ends()
+        return self._pressed() or self._deadline.expired
 
     @property
     def robot(self) -> Robot:
@@ -172,6 +169,21 @@ class StepPlanner:
         """Put the bodies of a world into the checker, with other pairs that may touch if they are given."""
         self.checker.become(world.scene, world.held, world.pairs if pairs is None else pairs)
 
+    def proved(self, world: TaskWorld, motion: Array | Trajectory) -> PathProof:
+        """Return the proof of a path, shape (N, dof), or a motion in a world.
+
+        Raises:
+            StepFailed: It is not free, or not proved in time.
+        """
+        self.become(world)
+        check = full_check(self.checker, motion, deadline=self._deadline.at)
+        if check and check.proof is not None:
+            return check.proof
+        if check.timed_out:
+            raise StepFailed(LATE)
+        contacts = [] if check.proof is None else self.checker.contacts(check.proof.state)
+        raise StepFailed(check.reason, f"collision {contacts[0].first} {contacts[0].second}" if contacts else "")
+
     def line_query(self, world: TaskWorld, step: StraightStep, q: Array, timing: Timing | None) -> LineQuery:
         """Return what a step along straight lines is about; the checker has the bodies of its world then.
 
@@ -188,7 +200,7 @@ class StepPlanner:
     def _line(self, world: TaskWorld, step: StraightStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return straight lines from poses of frames to poses, with blends between them."""
         query = self.line_query(world, step, q, timing)
-        found = plan_along(self.checker, query, self._deadline, self._ends)
+        found = plan_along(self.checker, query, self._deadline, self.ends)
         if not found or found.path is None:
             cause = "" if found.end is LineEnd.REACHED else " ".join((f"{found.end}", *found.blocked_by))
             raise StepFailed(found.reason, cause)
@@ -233,10 +245,7 @@ class StepPlanner:
         Raises:
             StepFailed: It is not free, or not timed in time.
         """
-        states = plan.path.states
-        self.become(plan.world)
-        check = full_check(self.checker, states, states[0], [states[-1]], deadline=self._deadline.at)
-        plan = replace(plan, clearance=checked(self.checker, check).clearance)
+        plan = replace(plan, clearance=self.proved(plan.world, plan.path.states).clearance)
         return plan if timing is None else self._timed(plan, timing)
 
     def _together(self, world: TaskWorld, step: TogetherStep, q: Array, timing: Timing | None) -> StepPlan:
@@ -253,12 +262,8 @@ class StepPlanner:
         motions = [plan.motion for plan in plans if plan.motion is not None]
         motion = superposed([(one, 0.0) for one in motions]) if len(motions) == len(plans) else None
         path = Path(abreast([plan.path.states for plan in plans]))
-        self.become(during)
-        check = full_check(self.checker, path.states if motion is None else motion, deadline=self._deadline.at)
-        clearance = checked(self.checker, check).clearance
-        lefts, use = [plan.left for plan in plans if not isnan(plan.left)], dict[str, float]()
-        for plan in plans:
-            use = {name: max(use.get(name, 0.0), share) for name, share in (use | dict(plan.use)).items()}
+        clearance = self.proved(during, path.states if motion is None else motion).clearance
+        lefts, use = [plan.left for plan in plans if not isnan(plan.left)], most_used(plan.use for plan in plans)
         if motion is not None and timing is not None:
             use |= self._kept_together(during, timing, motion)
         left = nan if not lefts else max(lefts) if motion is not None else float(len(path.states) - 1)
@@ -318,7 +323,7 @@ class StepPlanner:
             return check.reason
 
         try:
-            made = time_path(states, limits, self.robot.joint_names, how, fault, stop=self._ends, motion_limits=more)
+            made = time_path(states, limits, self.robot.joint_names, how, fault, stop=self.ends, motion_limits=more)
         except TimingError as error:
             raise StepFailed(f"it cannot be timed, {error}") from None
         motion = made.trajectory
@@ -409,6 +414,14 @@ def _blend(poses: Sequence[Mapping[str, Array]]) -> float:
         length(following[name][:3, 3] - pose[:3, 3]) for one, following in pairwise(poses) for name, pose in one.items()
     ]
     return BLEND * min((way for way in ways if way > SAME_POINT), default=0.0)
+
+
+def most_used(uses: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """Return the largest share of each limit among the shares that several motions use."""
+    found = dict[str, float]()
+    for use in uses:
+        found |= {name: max(found.get(name, 0.0), share) for name, share in use.items()}
+    return found
 
 
 def timing_in(world: TaskWorld, timing: Timing) -> Timing:

@@ -9,11 +9,9 @@ import numpy as np
 import pinocchio as pin
 
 from apex_ompl.collision import CollisionChecker
-from apex_ompl.collision.path_proof import PathProof
 from apex_ompl.collision.shapes import coal_geometry, world_geometry
 from apex_ompl.collision.solids import Solid, box_distances, closest, world_boxes
 from apex_ompl.constraints.frames import frame_of
-from apex_ompl.ompl.validity import FullCheck
 from apex_ompl.planning.task_world import TaskWorld, hand_links
 from apex_ompl.scene.steps import GraspStep, LineStep, RetreatStep, StraightStep, TurnStep
 from apex_ompl.types import Array
@@ -40,20 +38,6 @@ class StepFailed(Exception):  # noqa: N818 - an outcome, not an error
     def of(self, title: str) -> StepFailed:
         """Return the same about a step by its title."""
         return StepFailed(f"{title}: {self}", f"{title}: {self.cause}")
-
-
-def checked(checker: CollisionChecker, check: FullCheck) -> PathProof:
-    """Return the proof of a full check by a checker.
-
-    Raises:
-        StepFailed: It found a fault, or was not done in time.
-    """
-    if check and check.proof is not None:
-        return check.proof
-    if check.timed_out:
-        raise StepFailed(LATE)
-    contacts = [] if check.proof is None else checker.contacts(check.proof.state)
-    raise StepFailed(check.reason, f"collision {contacts[0].first} {contacts[0].second}" if contacts else "")
 
 
 def waypoints(world: TaskWorld, step: StraightStep, q: Array) -> Sequence[Mapping[str, Array]]:

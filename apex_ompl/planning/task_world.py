@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from apex_ompl.constraints.frames import LinkFace, frame_of
+from apex_ompl.constraints.frames import LinkFace, frame_of, holding_hand, holding_link
 from apex_ompl.errors import ApexError, FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.planning.line_query import tools_of
@@ -34,6 +34,7 @@ from apex_ompl.scene.steps import (
     ReleaseStep,
     RemoveStep,
     RetreatStep,
+    Step,
     TakingStep,
     TogetherStep,
     TurnStep,
@@ -139,7 +140,7 @@ class TaskWorld:
             }
         )  # fmt: skip
 
-    def after(self, step: AnyStep, q: Array) -> TaskWorld:
+    def after(self, step: Step, q: Array) -> TaskWorld:
         """Return the world after a step that ends in a state, shape (dof,).
 
         Raises:
@@ -187,8 +188,7 @@ class TaskWorld:
 
     def holder(self, name: str) -> str | None:
         """Return the hand that holds an object, or None where it is fixed to another link."""
-        hands = (hand for hand in self.robot.hands if self.held[name].link in hand_links(self.robot, hand))
-        return next(hands, None)
+        return holding_hand(self.robot, self.held[name].link)
 
     def _let_go(self, names: Sequence[str], hand: str | None, falls: bool, q: Array) -> TaskWorld:
         """Return the world without objects in a hand, or at the link that they are fixed to."""
@@ -215,8 +215,7 @@ class TaskWorld:
 
     def grasped(self, step: TakingStep, q: Array) -> TaskWorld:
         """Return the world in which the object of a step is held, taken where it is at a state, shape (dof,)."""
-        name, taker = step.object, step.hand if isinstance(step, GraspStep) else step.link
-        link = self.robot.hands[taker].palm if taker in self.robot.hands else taker
+        name, link = step.object, holding_link(self.robot, step.hand if isinstance(step, GraspStep) else step.link)
         scene, held = dict(self.scene), dict(self.held)
         if name in held:
             one = held[name]

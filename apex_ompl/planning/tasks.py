@@ -27,7 +27,7 @@ from apex_ompl.planning.query import Group
 from apex_ompl.planning.steps import assemble, query_fault
 from apex_ompl.planning.task_goals import TaskGoal, task_goal
 from apex_ompl.planning.task_motion import whole
-from apex_ompl.planning.task_overlaps import joints_needed, shorter, whole_at_once
+from apex_ompl.planning.task_overlaps import joints_needed, whole_at_once
 from apex_ompl.planning.task_rehearsal import Rehearsal
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner
@@ -189,8 +189,7 @@ class TaskPlanner:
             note = "no steps are done at once, since constraints along the path were proved for one after the other"
             return replace(made, notes=(*made.notes, note))
         assert self._first is not None
-        other = whole_at_once(self._steps, self._first, plans, self._problem)
-        return other if other is not None and shorter(other, made) else made
+        return whole_at_once(self._steps, made, self._first, plans)
 
     def _ends(self) -> bool:
         return self._interrupt.pressed or self._deadline.for_search <= 0.0

@@ -31,6 +31,7 @@ from benchmarks.planners.ik_branches import COUNT, HAND, ROBOT, SEEDS, dense
 DEPENDS = ("@planning",)
 ARM, FLANGE, BASE = "panda", "panda_link8", "panda_link0"
 JOINTS = 7
+DENSE, EVEN = 64, 1e-2  # states of each self-motion; how even their spacing is, all are on it anyway [rad]
 ROWS = "planner.ik", "ssik, solve", "ssik, self-motions"
 HEAD = (
     "states", "free states p50", "found of the dense search's %", "targets without one", "largest error um, urad",
@@ -88,11 +89,10 @@ class Rival:
         return self.free([one.q for one in self.arm.solve(at.inside)])
 
     def on_curves(self, at: Target) -> Array:
-        """Return free states on the self-motions, SPACING apart."""
+        """Return free states on the self-motions, about SPACING apart or nearer."""
         found = list[Array]()
         for chart in self.arm.self_motion(at.inside).charts:
-            count = max(2, int(np.ceil(chart.length() / SPACING)))
-            found += [states for _, states in chart.sample(count, limits=True)]
+            found += [states for _, states in chart.sample(DENSE, limits=True, tol=EVEN)]
         return self.free([q for states in found for q in states])
 
     def nearest(self, at: Target) -> Array | None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apex_ompl import MotionPlanner, PoseTarget, TaskResult
+from apex_ompl import MotionPlanner, PlanResult, PoseTarget, TaskResult, load_robot
 from apex_ompl.cli.parser import main
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
@@ -113,20 +113,64 @@ def test_an_arm_brings_a_box_while_the_other_one_puts_its_own_down() -> None:
     assert any("b" in step.title.split() and "left_hand" in step.title for step in result.steps if " + " in step.title)
 
 
+def boxes(planner: MotionPlanner) -> list[dict[str, object]]:
+    """Steps of two arms, each with a box of its own, the left one's first."""
+    steps = list[dict[str, object]]()
+    for side, y in (("left", 0.45), ("right", -0.45)):
+        planner.world.add(name=f"{side}_box", box=(0.05, 0.05, 0.1), position=(0.6, y, 0.6))
+        over = PoseTarget(frame=f"{side}_hand", position=(0.5, y, 0.5))
+        steps += [
+            {"kind": "move", "goal": over, "group": f"{side}_arm"},
+            {"kind": "attach", "object": f"{side}_box", "link": f"{side}_hand"},
+            {"kind": "line", "frame": f"{side}_hand", "by": (0.0, 0.0, 0.1)},
+            {"kind": "detach", "object": f"{side}_box"},
+            {"kind": "move", "goal": "home", "group": f"{side}_arm"},
+        ]
+    return steps
+
+
+@pytest.mark.parametrize("grouped", [True, False])
+def test_results_are_read_whatever_goes_on_at_the_goal(tmp_path: Path, grouped: bool) -> None:
+    """The motion to the goal, here a first step without a group, is done alone, and read as the plan to the goal."""
+    with MotionPlanner() as planner:
+        first, *rest = boxes(planner)
+        first = first if grouped else {name: value for name, value in first.items() if name != "group"}
+        result = planner.sequence("home", [first, *rest], search=AT_ONCE)
+    assert result and result.trajectory is not None and any(step.kind == "at once" for step in result.steps)
+    assert result.steps[0].kind == "goal" and result.steps[0].end == result.goal_time
+    assert (result.goal_time == 0.0) == grouped
+    for name in ("grasped", "released"):
+        assert sorted(body for step in result.steps for body in getattr(step, name)) == ["left_box", "right_box"]
+    result.save(tmp_path / "made.json")
+    read = TaskResult.load(tmp_path / "made.json")
+    assert read.goal_time == result.goal_time and [one.title for one in read.steps] == [
+        one.title for one in result.steps
+    ]
+    to_goal = PlanResult.load(tmp_path / "made.json").trajectory
+    assert to_goal is not None and to_goal.duration == result.goal_time
+
+
+def test_arms_without_hands_go_at_once() -> None:
+    robot = replace(load_robot("baxter"), hands={})
+    steps = list[dict[str, object]]()
+    with MotionPlanner(robot) as planner:
+        for side, turn in (("left", 0.4), ("right", -0.4)):
+            planner.world.add(name=f"{side}_box", box=(0.05, 0.05, 0.05), position=(1.5, turn, 1.5))
+            home = {name: float(robot.home[k]) for k, name in enumerate(robot.joint_names) if name.startswith(side)}
+            steps += [
+                {"kind": "move", "goal": home | {f"{side}_s0": home[f"{side}_s0"] + turn}, "group": f"{side}_arm"},
+                {"kind": "attach", "object": f"{side}_box", "link": f"{side}_wrist"},
+                {"kind": "move", "goal": home, "group": f"{side}_arm"},
+            ]
+        one, both = (planner.sequence("home", steps, search=TaskSearch(asynchronous=a)) for a in (False, True))
+    assert one and both and one.trajectory is not None and both.trajectory is not None
+    assert both.trajectory.duration < 0.6 * one.trajectory.duration and not task_fault(both, both.trajectory)
+
+
 def test_two_arms_with_boxes_of_their_own_take_half_of_the_time() -> None:
     """What is at once is what the steps need: boxes of each side; a wait is for both arms."""
-    steps = list[dict[str, object]]()
     with MotionPlanner() as planner:
-        for side, y in (("left", 0.45), ("right", -0.45)):
-            planner.world.add(name=f"{side}_box", box=(0.05, 0.05, 0.1), position=(0.6, y, 0.6))
-            over = PoseTarget(frame=f"{side}_hand", position=(0.5, y, 0.5))
-            steps += [
-                {"kind": "move", "goal": over, "group": f"{side}_arm"},
-                {"kind": "attach", "object": f"{side}_box", "link": f"{side}_hand"},
-                {"kind": "line", "frame": f"{side}_hand", "by": (0.0, 0.0, 0.1)},
-                {"kind": "detach", "object": f"{side}_box"},
-                {"kind": "move", "goal": "home", "group": f"{side}_arm"},
-            ]
+        steps = boxes(planner)
         one, both = (planner.sequence("home", steps, search=TaskSearch(asynchronous=a)) for a in (False, True))
         apart = [*steps[:5], {"kind": "wait", "seconds": 0.2}, *steps[5:]]
         waiting = planner.sequence("home", apart, search=AT_ONCE)

@@ -205,8 +205,12 @@ def _normal_equations(
 
 
 @inlined
-def _solve(gram: Floats, damping: float, factor: Floats, step: Floats) -> bool:
-    """Solve (gram + damping I) x = step in place, by Cholesky factors; only the lower half of ``gram`` is read."""
+def solve_damped(gram: Floats, damping: float, factor: Floats, step: Floats) -> bool:
+    """Solve (gram + damping I) x = step in place, by Cholesky factors; only the lower half of ``gram`` is read.
+
+    Returns:
+        Whether it is positive definite.
+    """
     n = len(step)
     for i in range(n):
         for k in range(i + 1):
@@ -279,7 +283,7 @@ def descend(
             count += 1
             for i in range(n):
                 b.step[i] = -b.gradient[now, i]
-            better = _solve(b.gram[now], damping, b.factor, b.step)
+            better = solve_damped(b.gram[now], damping, b.factor, b.step)
             new_error = error
             if better:
                 for i in range(n):
@@ -389,7 +393,7 @@ def approach(
                     b.step[i] = 0.0
                     for m in range(n):
                         b.gram[now, max(i, m), min(i, m)] = 1.0 if m == i else 0.0
-            better = _solve(b.gram[now], damping, b.factor, b.step)
+            better = solve_damped(b.gram[now], damping, b.factor, b.step)
             if better:
                 for i in range(n):
                     k = free[i]

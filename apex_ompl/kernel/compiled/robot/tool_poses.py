@@ -12,13 +12,13 @@ from typing import Annotated, NamedTuple
 from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays, robot_view
 from apex_ompl.kernel.compiled.compilation import entry_point, inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, buffer_sizes, buffer_view, table_view
+from apex_ompl.kernel.compiled.robot.inverse_kinematics import solve_damped
 from apex_ompl.kernel.compiled.robot.kinematics import place_joints
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 DAMPING = 1e-10  # lambda
 CLOSED = 1e-10  # error at which the method ends [m, rad]
 LARGEST_STEP = 0.4  # of a joint [rad]
-LEAST_PIVOT = 1e-14
 LEAST_SQUARE = 1e-6  # of the sine of a rotation of more than a quarter of a turn
 
 
@@ -43,6 +43,7 @@ class ToolBuffers(NamedTuple):
         place: Origin of each tool in the world [m].
         error: What each pose lacks of the wanted one, then the solution of the normal equations [m, rad].
         jacobian: Velocity and angular velocity of one tool by planned joint.
+        gram: J J^T, lower half.
         factor: Lower Cholesky factor of J J^T + lambda I.
         step: Its step.
     """
@@ -50,6 +51,7 @@ class ToolBuffers(NamedTuple):
     place: Annotated[Floats, "tools", 3]
     error: Annotated[Floats, "tools", 6]
     jacobian: Annotated[Floats, 6, "dof"]
+    gram: Annotated[Floats, 6, 6]
     factor: Annotated[Floats, 6, 6]
     step: Annotated[Floats, "dof"]
 
@@ -118,35 +120,22 @@ def _set_jacobian(t: RobotArrays, w: Workspace, j: int, place: Floats, moved: In
 
 
 @inlined
-def _factorize(moved: Integers, jacobian: Floats, factor: Floats) -> None:
-    """Put the lower Cholesky factor of J J^T + lambda I into ``factor``."""
+def _set_step(moved: Integers, x: Floats, b: ToolBuffers) -> float:
+    """Replace e in ``x`` by (J J^T + lambda I)^-1 e, set the step to J^T times it, and return its largest element.
+
+    It is 0 where the matrix is not positive definite by rounding.
+    """
+    jacobian, largest = b.jacobian, 0.0
     for i in range(6):
         for k in range(i + 1):
-            total = DAMPING if i == k else 0.0
+            b.gram[i, k] = 0.0
             for d in range(len(moved)):
                 if moved[d] != 0:
-                    total += jacobian[i, d] * jacobian[k, d]
-            for p in range(k):
-                total -= factor[i, p] * factor[k, p]
-            factor[i, k] = math.sqrt(max(total, LEAST_PIVOT)) if i == k else total / factor[k, k]
-
-
-@inlined
-def _set_step(moved: Integers, x: Floats, b: ToolBuffers) -> float:
-    """Replace e in ``x`` by (J J^T + lambda I)^-1 e, set the step to J^T times it, and return its largest element."""
-    jacobian, factor, largest = b.jacobian, b.factor, 0.0
-    _factorize(moved, jacobian, factor)
-    for i in range(6):
-        for p in range(i):
-            x[i] -= factor[i, p] * x[p]
-        x[i] /= factor[i, i]
-    for i in range(5, -1, -1):
-        for p in range(i + 1, 6):
-            x[i] -= factor[p, i] * x[p]
-        x[i] /= factor[i, i]
+                    b.gram[i, k] += jacobian[i, d] * jacobian[k, d]
+    solved = solve_damped(b.gram, DAMPING, b.factor, x)
     for d in range(len(moved)):
         b.step[d] = 0.0
-        if moved[d] != 0:
+        if solved and moved[d] != 0:
             for i in range(6):
                 b.step[d] += jacobian[i, d] * x[i]
         largest = max(largest, abs(b.step[d]))
