@@ -49,6 +49,7 @@ ENOUGH = 5e-4  # bound with which a cell is not divided further [m]
 NEAR = 2e-3  # bound that is tried first [m]
 FEW, MOSTLY = 16, 0.5  # cells, and share of them without a larger bound, from which larger bounds are given up
 SAMPLES = 500  # states at which the covers are tried
+MANY = 1 << 17  # pairs of convex pieces of bearings that are examined for one cell
 AT_ONCE = 256  # cells between two readings of the clock
 
 
@@ -115,10 +116,10 @@ class TableMaker:
         first, second = (self._solids[k] for k in pair.links)
         return first.part or first.name, second.part or second.name
 
-    def bounds(self, pair: NearPair, middles: Array, half: Array, *, least: float, need: float) -> Array:
+    def bounds(self, pair: NearPair, middles: Array, half: Array, **bounds: Any) -> Array:
         """Return :meth:`apex_ompl.kernel.box_bound.BoxBounds.over` of two links, the smaller of which moves."""
         first, second = sorted((self._row[k] for k in pair.links), key=lambda row: self._radii[row])
-        return self._bounds.over(first, second, middles, half, least=least, need=need)
+        return self._bounds.over(first, second, middles, half, **bounds)
 
     def _bounds_over(self, pair: NearPair, middles: Array, half: Array, least: float) -> Array:
         """Return lower bounds of the distance of two links over boxes; those below ``least`` are minus infinity [m].
@@ -159,7 +160,7 @@ class TableMaker:
                 bounds, needed = self._bounds_over(pair, middles, half, enough + SAFE), enough
                 if len(axes) == 1 and level >= HOPELESS[0] and len(near := np.flatnonzero(bounds < enough + SAFE)):
                     needed, least = THIN, THIN + SAFE
-                    bounds[near] = self.bounds(pair, middles[near], half, least=least, need=least + SAFE)
+                    bounds[near] = self.bounds(pair, middles[near], half, least=least, need=least + SAFE, most=MANY)
                 proved = bounds >= needed + SAFE
                 at = tuple(some[proved].T)
                 cells[at] = np.clip((bounds[proved] - SAFE) / UNIT, 1, LARGEST)

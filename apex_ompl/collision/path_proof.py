@@ -97,7 +97,7 @@ class PathProof:
         parameter: Where on the curve the fault is, or the least distance found.
         state: The state there, shape (dof,).
         clearance: Least distance of a checked pair that was found at a state [m], infinite where there is no pair, NaN
-            for hands outside their limits.
+            for hands outside their limits. Links that a table proves to be apart as in a bearing do not count.
         clearance_bound: Least distance that is proved along the whole curve [m]; 0 without a proof.
         pair: Names of the two bodies at the least distance found; empty where there is none.
         by_spheres: Share of the curve's length that the sphere covers proved alone; exact shapes proved the rest.

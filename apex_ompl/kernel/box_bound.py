@@ -26,7 +26,9 @@ class BoxBounds:
         buffers = *kernel.workspace(), *new_buffers(PairBuffers)[:2], *new_buffers(box_bound.BoxBuffers)[:2]
         self._arrays = (*kernel.robot.packed, *shapes, *buffers)
 
-    def over(self, first: int, second: int, middles: Array, half: Array, *, least: float, need: float) -> Array:
+    def over(
+        self, first: int, second: int, middles: Array, half: Array, *, least: float, need: float, most: int = 4096
+    ) -> Array:
         """Return lower bounds of the distance of two bodies over boxes of states, shape (N,) [m].
 
         The formula is that of :mod:`apex_ompl.kernel.compiled.check.box_bound`.
@@ -38,7 +40,8 @@ class BoxBounds:
             half: Half widths of all of them, shape (dof,).
             least: Bounds that are not larger may be given as minus infinity [m].
             need: Bounds that are larger may be given as smaller ones, which are not smaller than this [m].
+            most: Pairs of convex pieces that are examined for a box at most; beyond it is minus infinity.
         """
         found = np.empty(len(middles))
-        box_bound.box_bounds(*self._arrays, first, second, compact(middles), compact(half), least, need, found)
+        box_bound.box_bounds(*self._arrays, first, second, compact(middles), compact(half), least, need, most, found)
         return found

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from apex_ompl.kernel.compiled.check.clearance_table import LARGEST, THIN, UNIT
+from apex_ompl.kernel.compiled.check.clearance_table import BEARING, LARGEST, THIN, UNIT
 from apex_ompl.types import Array
 
 __all__ = ["LARGEST", "THIN", "UNIT", "ClearanceTable", "table_arrays"]
 
 NO_AXES = ((0.0, 0.0), (0.0, 0.0))
+MOSTLY_THIN = 0.1  # least share of a joint's range in which bearings are apart by THIN
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +39,11 @@ class ClearanceTable:
     def proved(self) -> float:
         """Share of the range of the joints for which the bodies are proved apart."""
         return float(np.mean(self.cells > 0))
+
+    @property
+    def is_bearing(self) -> bool:
+        """Whether the bodies turn or slide beside each other, as near as they may be, over some of a joint's range."""
+        return len(self.joints) == 1 and float(np.mean(self.cells == 1)) >= MOSTLY_THIN
 
     def levels(self) -> list[NDArray[np.uint8]]:
         """Return the cells and the least values of ever larger ones, down to a single one."""
@@ -70,7 +76,7 @@ def table_arrays(tables: Sequence[ClearanceTable | None], joint_names: Sequence[
         rows.append(len(cells))
         dofs = [joint_names.index(name) for name in table.joints]
         per_unit = len(table.cells) / (table.upper - table.lower)
-        joints.append((dofs + [-1, -1])[:3])
+        joints.append([*dofs, BEARING, -1] if table.is_bearing else (dofs + [-1, -1])[:3])
         ranges.append([*zip(table.lower, per_unit, strict=True), *NO_AXES][:3])
         cells.append((size, len(table.cells)))
         levels = [level.ravel() for level in table.levels()]

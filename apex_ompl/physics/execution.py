@@ -6,7 +6,7 @@ by welds (:mod:`apex_ompl.drivers.grasps`). Each step begins once the hands have
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,14 +16,12 @@ from apex_ompl.constraints.frames import holding_link
 from apex_ompl.drivers.grasps import GRASPING, LOST, Grasps, hands_of, holder_of, in_link, turned
 from apex_ompl.drivers.mujoco import MujocoDriver
 from apex_ompl.drivers.twin_settings import TwinSettings
-from apex_ompl.drivers.vessels import filled
-from apex_ompl.physics.judges import Check, Intended, Judge
+from apex_ompl.physics.judges import Check, Judge
 from apex_ompl.physics.result import DONE, DROPPED, FAILED, TaskRun
+from apex_ompl.physics.stages import Stage, intended, let_go, stages
 from apex_ompl.physics.trials import Trial, grasped_later
-from apex_ompl.planning.task_result import TaskResult, TaskStep
+from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.robot import Robot
-from apex_ompl.scene.bodies import AttachedObject
-from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.steps import (
     AddStep,
     AttachStep,
@@ -32,7 +30,6 @@ from apex_ompl.scene.steps import (
     ReleaseStep,
     RemoveStep,
     Step,
-    parts,
 )
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array
@@ -41,9 +38,6 @@ RATE = 100.0  # of the log [1/s]
 FILM_RATE = 24.0  # frames of a film [1/s]
 SETTLING, RESTING = 0.2, 1.0  # at rest before the first motion, and after the last one [s]
 SLIP, SLIP_ANGLE = 0.005, 0.1  # of objects that friction holds, at most, along a rehearsal [m, rad]
-STEEPEST = 0.3  # ratio of level acceleration to gravity of what stands on a tray, and of liquids, at most
-GRAVITY = 9.81  # [m/s^2]
-SAMPLES = 400  # of a motion
 HARD = 0.8, 1.2  # factors of friction and mass in a rehearsal
 
 Frames = list[Any]
@@ -139,55 +133,60 @@ class Executor:
         Args:
             plan: The plan for ``trial.known``, with a motion.
         """
-        driver, motion = self.driver, plan.trajectory
-        assert motion is not None
+        driver = self.driver
         lost = [one for one in self.grasps.found if one.kind == LOST]
-        after: list[Step | None] = [None, *plan.problem.after]
-        start: float | None = None  # of motions that go over into each other
-        for planned, step in zip(plan.steps, after, strict=True):
+        made = stages(self.robot, plan)
+        for stage in made:
             if driver.fault:
                 break
-            start = planned.start if start is None else start
-            if planned.blended:
-                continue
-            whole = replace(planned, start=start)
-            self._follow(planned, step, motion_of(self.robot, self.trial.known, motion, whole))
-            start = None
+            self._follow(stage)
         self.wait(RESTING)
         still = {body.name for body in (*self.trial.known.scene, *self.robot.fixtures)}
         touched = [pair for pair in self._touched() if still & set(pair)]
-        end = plan.steps[-1].path.states[-1]
-        judge = Judge(self.trial.known, driver, intended(self.robot, plan), end, self._standing, touched)
+        end = made[-1].motion.positions[-1]
+        judge = Judge(self.trial.known, driver, intended(self.robot, made), end, self._standing, touched)
         checks = (*judge.checks(), Check("the robot follows its motion", not driver.fault, driver.fault or "it does"))
         return self._result(plan, checks, [f"{one.hand} did not get hold of {one.object}" for one in lost])
 
-    def _follow(self, planned: TaskStep, step: Step | None, motion: Trajectory) -> None:
+    def _follow(self, stage: Stage) -> None:
         driver, begin = self.driver, self.driver.time
-        driver.allow(planned.allowed)
-        for one in parts([step]):
-            if isinstance(one, ReleaseStep):
-                self.grasps.open(one.hand)
-            for name in one.objects if isinstance(one, RemoveStep | AddStep) else ():
-                driver.twin.remove(name, isinstance(one, RemoveStep))
-        if motion.duration > 0.0:
-            driver.send(motion, max(driver.time, driver.end))
+        driver.allow(stage.allowed)
+        start = max(driver.time, driver.end)
+        if stage.motion.duration > 0.0:
+            driver.send(stage.motion, start)
+        for time, step in stage.begun:
+            self._to(start + time)
+            self._begin(step)
+        if stage.motion.duration > 0.0:
             self._to(driver.end)
-        held = {one.name: one for one in planned.attached}
-        for one in parts([step]):
-            if isinstance(one, ReleaseStep):
-                links = self.robot.hand_of(self.robot.hands[one.hand].palm)
-                mine = [name for name in planned.released if set(held[name].holders) & set(links)]
-                self.grasps.release(mine, one.hand, self._to)
-            if isinstance(one, GraspStep):
-                self.grasps.grasp(one.object, one.hand, self._to)
-            if isinstance(one, AttachStep):
-                self.grasps.attach(one.object, holding_link(self.robot, one.link))
-            if isinstance(one, DetachStep):
-                others = [k for k in planned.attached if k.name != one.object and k.touch_links != ()]
-                busy = {hand for other in others for hand in hands_of(self.robot, other)}
-                own, links = holder_of(self.robot, held[one.object])
-                self.grasps.detach(one.object, links, [hand for hand in own if hand not in busy], self._to)
-        self._steps.append((planned.title, round(begin, 4), round(driver.time, 4)))
+        begun = [step for _, step in stage.begun]
+        for step in stage.done:
+            if step not in begun:
+                self._begin(step)
+            self._end(stage, step)
+        self._steps.append((stage.title, round(begin, 4), round(driver.time, 4)))
+
+    def _begin(self, step: Step) -> None:
+        """Do what a step does at its start."""
+        if isinstance(step, ReleaseStep):
+            self.grasps.open(step.hand)
+        for name in step.objects if isinstance(step, RemoveStep | AddStep) else ():
+            self.driver.twin.remove(name, isinstance(step, RemoveStep))
+
+    def _end(self, stage: Stage, step: Step) -> None:
+        """Do what a step does at its end, which is that of the stage."""
+        if isinstance(step, ReleaseStep):
+            self.grasps.release(let_go(self.robot, stage, step)[0], step.hand, self._to)
+        if isinstance(step, GraspStep):
+            self.grasps.grasp(step.object, step.hand, self._to)
+        if isinstance(step, AttachStep):
+            self.grasps.attach(step.object, holding_link(self.robot, step.link))
+        if isinstance(step, DetachStep):
+            held = {one.name: one for one in stage.attached}
+            others = [one for one in stage.attached if one.name != step.object and one.touch_links != ()]
+            busy = {hand for other in others for hand in hands_of(self.robot, other)}
+            own, links = holder_of(self.robot, held[step.object])
+            self.grasps.detach(step.object, links, [hand for hand in own if hand not in busy], self._to)
 
     def _stood(self) -> dict[str, tuple[str, Array]]:
         """Return what stands on what, of objects that no link may touch, liquids apart."""
@@ -249,56 +248,3 @@ def _advance(driver: MujocoDriver, until: float, watch: Callable[[], None]) -> N
     for k in range(1, int(np.ceil((until - begin) * RATE)) + 1):
         driver.advance(max(driver.time, min(until, begin + k / RATE)))
         watch()
-
-
-def motion_of(robot: Robot, problem: Problem, motion: Trajectory, step: TaskStep) -> Trajectory:
-    """Return the part of a motion that is a step, slowed down where what stands or flows would fall or spill.
-
-    Args:
-        robot: The robot.
-        problem: The problem.
-        motion: The motion through all steps.
-        step: The step, at rest at both ends.
-    """
-    first, last = (int(np.argmin(np.abs(motion.times - time))) for time in (step.start, step.end))
-    inside = slice(first, last + 1)
-    times = motion.times[inside] - motion.times[first]
-    part = Trajectory(
-        times, motion.positions[inside], motion.velocities[inside], motion.accelerations[inside], motion.joint_names
-    )  # fmt: skip
-    full = filled(problem)
-    loose = [held for held in step.attached if held.touch_links == () or held.name in full]
-    s = min((_gentle(robot, held, part) for held in loose), default=1.0)
-    return Trajectory(times / s, part.positions, s * part.velocities, s * s * part.accelerations, part.joint_names)
-
-
-def _gentle(robot: Robot, held: AttachedObject, motion: Trajectory) -> float:
-    """Return the factor of the speed of a motion at which an object's level acceleration is small enough."""
-    if motion.duration <= 0.0:
-        return 1.0
-    times = np.linspace(0.0, motion.duration, SAMPLES)
-    places = np.array([(robot.link_pose(q, held.link) @ held.pose)[:3, 3] for q in motion(times)])
-    a = np.diff(places, 2, axis=0) / (times[1] - times[0]) ** 2
-    need = np.linalg.norm(a[:, :2], axis=1) - STEEPEST * a[:, 2]
-    return float(min(1.0, np.sqrt(STEEPEST * GRAVITY / max(float(need.max()), 1e-9))))
-
-
-def intended(robot: Robot, plan: TaskResult) -> Mapping[str, Intended]:
-    """Return where a plan has the objects at the end."""
-    found: dict[str, Intended] = {}
-    for planned, step in zip(plan.steps, (None, *plan.problem.after), strict=True):
-        for held in planned.attached:
-            found[held.name] = Intended(held.name, held.link, held.pose)
-        hands = [one.hand for one in parts([step]) if isinstance(one, ReleaseStep)]
-        links, end = {k for hand in hands for k in robot.hand_of(robot.hands[hand].palm)}, planned.path.states[-1]
-        detached = {one.object for one in parts([step]) if isinstance(one, DetachStep)}
-        for name in planned.released:
-            one = next(held for held in planned.attached if held.name == name)
-            pose = robot.link_pose(end, one.link) @ one.pose
-            own = holder_of(robot, one)[1] if name in detached else links
-            others = [link for link in one.holders if link not in own]
-            if others:
-                found[name] = Intended(name, others[0], np.linalg.inv(robot.link_pose(end, others[0])) @ pose)
-            else:
-                found[name] = Intended(name, "", pose, name in planned.gone)
-    return found

@@ -13,11 +13,13 @@ from apex_ompl.drivers.grasps import GRASPING
 from apex_ompl.drivers.twin_settings import TwinSettings
 from apex_ompl.drivers.vessels import filled
 from apex_ompl.errors import ParameterError
-from apex_ompl.physics.execution import Executor, motion_of, rehearsed
+from apex_ompl.physics.execution import Executor, rehearsed
 from apex_ompl.physics.result import UNPLANNED, TaskRun
+from apex_ompl.physics.stages import motion_of
 from apex_ompl.physics.trials import Spread, draw, nominal
 from apex_ompl.planning.planner import MotionPlanner
-from apex_ompl.planning.task_result import AT_ONCE, TaskResult
+from apex_ompl.planning.task_result import TaskResult
+from apex_ompl.planning.tasks import TaskSearch
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.constraints import Upright
@@ -40,6 +42,7 @@ class TaskRunner:
         settings: Settings of the model.
         timeout: Of each plan [s].
         friction: Names of the objects that friction holds; by default those of a rehearsal from the problem's start.
+        search: How the steps of the task are planned.
         executor: That of the last run, with the robot and the objects as they were at its end; None before.
     """
 
@@ -48,6 +51,7 @@ class TaskRunner:
     settings: TwinSettings = GRASPING
     timeout: float = TIMEOUT
     friction: Collection[str] | None = None
+    search: TaskSearch = field(default_factory=TaskSearch)
     executor: Executor | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -124,7 +128,11 @@ class TaskRunner:
         for k in range(PLANS):
             found.append(
                 self._planner.plan_task(
-                    known, timeout=self.timeout, seed=seed + k * SEEDS, constraints=self._level(known)
+                    known,
+                    timeout=self.timeout,
+                    seed=seed + k * SEEDS,
+                    constraints=self._level(known),
+                    search=self.search,
                 )  # fmt: skip
             )
             if found[-1] and found[-1].steps[0].clearance >= place:
@@ -142,7 +150,8 @@ class TaskRunner:
 def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
     """Execute a plan in physics, from the start and with the objects that it was planned for.
 
-    Objects that a hand holds at the start are welded to it.
+    Objects that a hand holds at the start are welded to it. While a hand closes or opens, all arms are at rest: where
+    arms do steps at once, the whole motion stops along its path there.
 
     Args:
         plan: A planned task or sequence, or the plan of one motion, such as that of a schedule; with a motion.
@@ -150,7 +159,7 @@ def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
 
     Raises:
         ParameterError: It is no result of a plan, or has no motion that starts at rest, or an obstacle moves, or
-            steps are done at once, since hands wait until they hold, or fingers do not yield.
+            fingers do not yield.
     """
     if not isinstance(plan, PlanResult):
         raise ParameterError(
@@ -165,8 +174,6 @@ def execute(plan: PlanResult, settings: TwinSettings = GRASPING) -> TaskRun:
         raise ParameterError("plan", what, "a motion that starts at rest")
     if not isinstance(plan, TaskResult) or not plan.steps:
         plan = TaskResult.of_motion(plan)
-    if any(step.kind == AT_ONCE for step in plan.steps):
-        raise ParameterError("plan", "steps of several arms at once", "steps one after the other, without asynchronous")
     runner = TaskRunner(plan.problem, settings=settings)
     trial = nominal(runner.robot, plan.problem, settings.density)
     executor = Executor(runner.robot, trial, friction=(), settings=settings)

@@ -23,7 +23,7 @@ from apex_ompl.errors import RobotError
 from apex_ompl.goals.arms import Arm, arms_of
 from apex_ompl.paths.path import Path
 from apex_ompl.planning.task_motion import changes
-from apex_ompl.planning.task_result import AT_ONCE, TaskResult, TaskStep
+from apex_ompl.planning.task_result import AT_ONCE, StepTimes, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner, most_used
 from apex_ompl.planning.task_waypoints import LATE, StepFailed
 from apex_ompl.planning.task_world import TaskWorld
@@ -147,6 +147,7 @@ def whole_at_once(
     return replace(
         made, steps=tuple(steps), trajectory=motion, limit_use=uses | dict(motion.use(planner.robot.limits)),
         motion_clearance=min(step.clearance for step in steps), notes=found.notes,
+        schedule=tuple(StepTimes(one.start, one.end, one.done) for one in placed),
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from math import isnan, nan
-from typing import Any
+from typing import Any, NamedTuple
 
 from apex_ompl.errors import ApexError, FileFormatError, ParameterError
 from apex_ompl.paths.path import Path
@@ -34,6 +34,20 @@ class _Bodies(StrictModel):
     attached: tuple[AttachedObject, ...] = ()
     allowed: tuple[tuple[str, str], ...] = ()
     leaving: tuple[tuple[str, str], ...] = ()
+
+
+class StepTimes(NamedTuple):
+    """Times of a step that is done beside others.
+
+    Attributes:
+        start: When it starts [s].
+        end: When it ends [s].
+        done: When the world changes by it [s]: a retreating hand leaves an object before its end.
+    """
+
+    start: float
+    end: float
+    done: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +153,14 @@ class TaskResult(PlanResult):
         steps: The motion to the goal and the steps after it; empty where the task was not planned.
         goals_examined: Goals from which the steps after them were tried.
         goals_rejected: Why steps after the goal could not be done -> number of goals.
+        schedule: Times of the motion to the goal and of each step of the problem after it, where several arms do steps
+            at once and ``steps`` are the times between events; else empty.
     """
 
     steps: tuple[TaskStep, ...] = ()
     goals_examined: int = 0
     goals_rejected: Mapping[str, int] = field(default_factory=dict)
+    schedule: tuple[StepTimes, ...] = ()
 
     def __repr__(self) -> str:
         """Return the status, the steps and the motion, in one line."""
@@ -220,7 +237,10 @@ class TaskResult(PlanResult):
     def as_dict(self) -> dict[str, Any]:
         """Return the fields as plain data, ready for JSON."""
         steps = [step.as_dict(self.problem) for step in self.steps]
-        task = {"goals_examined": self.goals_examined, "goals_rejected": dict(self.goals_rejected), "steps": steps}
+        task = {
+            "goals_examined": self.goals_examined, "goals_rejected": dict(self.goals_rejected), "steps": steps,
+            "schedule": [list(one) for one in self.schedule],
+        }  # fmt: skip
         return super().as_dict() | {"goal_time": _number(self.goal_time), "task": task}
 
     @classmethod
@@ -237,7 +257,9 @@ class TaskResult(PlanResult):
             task = data["task"]
             steps = tuple(TaskStep.of_dict(one, found.problem, file) for one in task["steps"])
             rejected = {str(reason): int(count) for reason, count in task["goals_rejected"].items()}
-            return replace(found, steps=steps, goals_examined=int(task["goals_examined"]), goals_rejected=rejected)
+            schedule = tuple(StepTimes(*map(float, one)) for one in task["schedule"])
+            examined = int(task["goals_examined"])
+            return replace(found, steps=steps, goals_examined=examined, goals_rejected=rejected, schedule=schedule)
         except (*BROKEN, ApexError, AttributeError) as error:
             raise FileFormatError(file, "task", str(error), "expected the result of a task") from error
 

@@ -11,11 +11,13 @@ Usage: python -m benchmarks.physics.cells [-n 20] [--first 1000] [--kind handove
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 from apex_ompl.drivers.library import mujoco
 from apex_ompl.physics import Spread, TaskRunner
+from apex_ompl.planning import TaskSearch
 from apex_ompl.problems import cells
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.validation import whole_number
@@ -26,6 +28,7 @@ from benchmarks.physics import tasks
 DEPENDS = ("@planning", "apex_ompl/timing", "apex_ompl/drivers", "apex_ompl/physics")
 FOLDER = RUNS / "cells_in_physics"
 TIMEOUT = 60.0  # of a plan [s]
+TWO_ARMS = "handover", "stacking"  # which have asynchronous rows
 
 
 def main() -> None:
@@ -40,13 +43,16 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
     lines = [record.row(list(tasks.HEAD)), record.row(["---"] * len(tasks.HEAD))]
     seeds, found = range(given.first, given.first + given.n), dict[str, list[dict[str, Any]]]()
-    for place in given.place:
+    for place, asynchronous in product(given.place, (False, True)):
         for kind in given.kind or cells.names():
-            name = kind if place == 0.0 else f"{kind}, objects {1e3 * place:g} mm off"
+            if asynchronous and kind not in TWO_ARMS:
+                continue
+            parts = [kind, *["asynchronous"] * asynchronous, *([f"objects {1e3 * place:g} mm off"] if place else [])]
+            name, search = ", ".join(parts), TaskSearch(asynchronous=asynchronous)
             rows = tasks.made(
                 name.replace(", ", "-").replace(" ", "_"), seeds, FOLDER,
-                lambda seed, kind=kind, place=place: TaskRunner(
-                    cells.draw(kind, seed), Spread(place=place), timeout=TIMEOUT
+                lambda seed, kind=kind, place=place, search=search: TaskRunner(
+                    cells.draw(kind, seed), Spread(place=place), timeout=TIMEOUT, search=search
                 ),
                 given.pictures,
             )  # fmt: skip

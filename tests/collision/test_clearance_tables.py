@@ -19,7 +19,9 @@ from apex_ompl.collision.tables import joint_tree
 from apex_ompl.errors import FileFormatError
 from apex_ompl.kernel import Kernel
 from apex_ompl.kernel.clearance_table import THIN, UNIT
+from apex_ompl.paths.path import Path as States
 from apex_ompl.robot import Robot
+from apex_ompl.scene.bodies import Obstacle
 
 
 @pytest.fixture(scope="module")
@@ -283,4 +285,8 @@ def test_links_that_are_as_close_as_a_bearing_are_proved_apart_by_little(tmp_pat
     assert (cells == 1).all() and prepare_clearances(robot, 20.0) is not None
     checker, states = CollisionChecker(load_robot(tmp_path / "disks.robot.yaml")), np.linspace(-2, 2, 101)[:, None]
     assert (checker.kernel.unproved(states)[1] == 0).all() and checker.kernel.proves(np.array([[-2.0], [2.0]]), 0.01)
-    assert (checker.kernel.clearance(states, 0.01)[:, 1] <= gap + 1e-9).all()  # .01 mm, and not the .1 mm of a unit
+    assert (checker.kernel.clearance(states, 0.01)[:, 1] == 0.01).all()  # bearings do not count
+    far = CollisionChecker(checker.robot, [Obstacle(name="box", position=(0.0, 0.0, 0.22 + gap), box=(0.4, 0.4, 0.1))])
+    proof = far.prove(States(np.array([[-2.0], [2.0]])))
+    assert proof and proof.pair == ("high", "box") and proof.clearance == pytest.approx(0.02, abs=1e-5)
+    assert proof.intervals < 1000  # and not thousands, for the distance of the disks along the whole path

@@ -18,7 +18,7 @@ from apex_ompl.cli import main
 from apex_ompl.drivers import TwinSettings
 from apex_ompl.errors import ApexError, ParameterError, UnknownNameError
 from apex_ompl.physics import Spread, TaskRun, TaskRunner, execute, execution
-from apex_ompl.physics.execution import GRAVITY, STEEPEST, intended, motion_of
+from apex_ompl.physics.stages import GRAVITY, STEEPEST, intended, motion_of, stages
 from apex_ompl.planning import ArmStep, schedule
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.problems import cells
@@ -100,7 +100,7 @@ def test_steps_are_slow_enough_for_what_stands_and_flows(robot: Robot) -> None:
 
 def test_objects_are_intended_where_the_plan_leaves_them(robot: Robot) -> None:
     plan = plan_task("handover", timeout=SECONDS)
-    bar = intended(robot, plan)["bar"]
+    bar = intended(robot, stages(robot, plan))["bar"]
     end = plan.steps[-1].path.states[-1]
     assert bar.link == "right_hand_palm" and not bar.falls
     assert plan.trajectory is not None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,14 @@ from apex_ompl.cli.parser import main
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.physics import execute
+from apex_ompl.physics.stages import stages
 from apex_ompl.planning import TaskSearch, task_overlaps
 from apex_ompl.planning.task_motion import task_fault
 from apex_ompl.planning.task_overlaps import PlacedStep, overlapped
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner
 from apex_ompl.problems import cells
-from apex_ompl.scene.steps import RetreatStep
+from apex_ompl.scene.steps import GraspStep, RetreatStep
+from apex_ompl.timing.rests import is_at_rest
 
 SECONDS = 60.0
 AT_ONCE = TaskSearch(asynchronous=True)
@@ -203,5 +206,31 @@ def test_steps_at_once_are_planned_from_files_saved_and_read(
     read = TaskResult.load(out)
     assert read.trajectory is not None and not task_fault(read, read.trajectory)
     assert [step.kind for step in read.steps].count("at once") >= 1
-    with pytest.raises(ParameterError, match="expected steps one after the other, without asynchronous"):
-        execute(read)
+    titles = [step.title for step in read.problem.after]
+    took = {name: when for name, when in zip(titles, read.schedule[1:], strict=True)}
+    assert took["grasp bar by left_hand"].end <= took["move bar"].start
+    assert (
+        read.schedule[0].end == read.goal_time and max(when.end for when in read.schedule) == read.trajectory.duration
+    )
+    assert all(when.start <= when.done <= when.end for when in read.schedule)
+
+
+def test_steps_at_once_are_executed_in_physics_with_stops_where_hands_close() -> None:
+    result = made("handover", 2003, True)
+    run = execute(result)
+    assert run and not run.contacts, run.reason
+    with MotionPlanner("dual_panda_softhand") as planner:
+        robot = planner.robot
+    parts = stages(robot, result)
+    grasps = [step.title for stage in parts for step in stage.done if isinstance(step, GraspStep)]
+    assert grasps == ["grasp bar by left_hand", "grasp bar by right_hand"]
+    assert result.trajectory is not None
+    assert any(not is_at_rest(result.trajectory, when.done) for when in result.schedule)  # as another arm moves
+    for stage in parts:
+        assert is_at_rest(stage.motion, 0.0) and is_at_rest(stage.motion, stage.motion.duration)
+        assert max(stage.motion.use(robot.limits).values()) <= 1.0 + 1e-6
+    for stage, after in pairwise(parts):
+        np.testing.assert_allclose(stage.motion.positions[-1], after.motion.positions[0], atol=1e-9)
+    assert sum(stage.motion.duration for stage in parts) < 1.3 * result.trajectory.duration
+    first = made("handover", 2003, False)
+    assert run.metrics["duration"] < execute(first).metrics["duration"]

@@ -59,9 +59,9 @@ class RobotArrays(NamedTuple):
 
     ``bodies_table`` is the clearance table of each of ``bodies``, or -1, see
     :mod:`apex_ompl.kernel.compiled.check.clearance_table`. ``table_joints`` are the one to three planned joints that it
-    depends on (else -1), ``table_cells`` its first byte and number of cells along each axis, ``table_range`` for each
-    joint the lowest value and cells per unit (a whole turn of a continuous one), ``table_bytes`` eight bytes in each
-    number.
+    depends on (else negative), ``table_cells`` its first byte and number of cells along each axis, ``table_range`` for
+    each joint the lowest value and cells per unit (a whole turn of a continuous one), ``table_bytes`` eight bytes in
+    each number.
     """
 
     joint_parent: Integers

@@ -278,7 +278,7 @@ CONSTRAINED = Group(
 
 OTHERS: Functions = {
     "check.box_bound.box_bounds": (
-        2 * ROBOT + WORKSPACE + 2 * BUFFERS + "i8, i8, f8[:, ::1], f8[::1], f8, f8, f8[::1]",
+        2 * ROBOT + WORKSPACE + 2 * BUFFERS + "i8, i8, f8[:, ::1], f8[::1], f8, f8, i8, f8[::1]",
         6,
     ),
     "geometry.cloud_distance.near_mesh": (

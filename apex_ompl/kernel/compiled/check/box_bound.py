@@ -39,7 +39,6 @@ from apex_ompl.kernel.compiled.robot.kinematics import place_joints, place_robot
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
 MOST_AXES = 32  # joints between two bodies that move
-MOST_LEAVES = 4096  # pairs of convex pieces that are examined for one box
 
 
 class BoxBuffers(NamedTuple):
@@ -188,7 +187,7 @@ def _balls_bound(h: ShapeArrays, g: PairBuffers, x: BoxBuffers, m: int, n: int) 
 
 @outlined
 def box_bound(
-    f: Frames, h: ShapeArrays, g: PairBuffers, x: BoxBuffers, a: int, b: int, least: float, need: float
+    f: Frames, h: ShapeArrays, g: PairBuffers, x: BoxBuffers, a: int, b: int, least: float, need: float, most: int
 ) -> float:
     """Return a lower bound of the distance of two shapes over the box of ``f`` around the state in its middle [m].
 
@@ -201,6 +200,7 @@ def box_bound(
         b: Shape of the other side.
         least: The search ends where a bound is not larger than this [m].
         need: Lower bound that suffices [m].
+        most: Pairs of convex pieces that are examined at most.
     """
     place_shape(f, h, a, g, 0)
     place_shape(f, h, b, g, 1)
@@ -227,7 +227,7 @@ def box_bound(
             leaves += 1
             if here >= limit or not (inner or other):
                 bound = min(bound, here)
-                if here <= least or leaves > MOST_LEAVES:
+                if here <= least or leaves > most:
                     return -math.inf
                 continue
         if top + 2 > MOST_NODES:
@@ -256,14 +256,15 @@ def _place(t: RobotArrays, w: Workspace, q: Floats) -> None:
 @entry_point
 def box_bounds(
     ri: Integers, rf: Floats, hi: Integers, hf: Floats, wi: Integers, wf: Floats, gi: Integers, gf: Floats,
-    xi: Integers, xf: Floats, a: int, b: int, middles: Floats, half: Floats, least: float, need: float, bounds: Floats,
+    xi: Integers, xf: Floats, a: int, b: int, middles: Floats, half: Floats, least: float, need: float, most: int,
+    bounds: Floats,
 ) -> None:  # fmt: skip
     """Put lower bounds of the distance of two bodies over boxes of states into ``bounds`` (N,) [m].
 
     Robot and shapes come packed, then the buffers of a state, a pair and a box. Body ``a`` moves as seen from body
     ``b``. The boxes have their middles in ``middles``, shape (N, dof), and all the same half widths, shape (dof,).
-    Bounds that are not larger than ``least`` may be minus infinity; those above ``need`` may be smaller, but not below
-    it.
+    Bounds that are not larger than ``least`` may be minus infinity, as may those for which more than ``most`` pairs of
+    pieces would be examined; those above ``need`` may be smaller, but not below it.
     """
     t, h = robot_view(ri, rf), shapes_view(hi, hf)
     w, g, x = workspace_view(t, wi, wf), pair_view(gi, gf, ()), _box_view(xi, xf, ())
@@ -275,4 +276,4 @@ def box_bounds(
     )  # fmt: skip
     for k in range(len(middles)):
         _place(t, w, middles[k])
-        bounds[k] = box_bound(f, h, g, x, a, b, least, need)
+        bounds[k] = box_bound(f, h, g, x, a, b, least, need, most)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from apex_ompl.kernel.compiled.arrays import FIXED, REVOLUTE, RobotArrays, SceneArrays
-from apex_ompl.kernel.compiled.check.clearance_table import clearance_of_cell
+from apex_ompl.kernel.compiled.check.clearance_table import clearance_of_cell, is_bearing
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.geometry.signed_distance import direction, distance, is_allowed, next_obstacles
 from apex_ompl.kernel.compiled.layout import Floats
@@ -116,9 +116,12 @@ def nearest_bodies(t: RobotArrays, w: Workspace, q: Floats, limit: float) -> Nea
 
 @inlined
 def nearest_of_bodies(t: RobotArrays, w: Workspace, q: Floats, k: int, best: Nearest) -> Nearest:
-    """Return the nearer of ``best`` and the nearest leaves of pair ``k`` of bodies, not nearer than its table shows."""
+    """Return the nearer of ``best`` and the nearest leaves of pair ``k`` of bodies, not nearer than its table shows.
+
+    Bearings do not count.
+    """
     apart = clearance_of_cell(t, k, q) if t.bodies_table[k] >= 0 else 0.0
-    if apart > 0.0 and apart >= best[0]:
+    if apart > 0.0 and (apart >= best[0] or is_bearing(t, k, apart)):
         return best
     found = nearest_leaves(t, w, t.bodies[k, 0], t.bodies[k, 1], best)
     if apart > 0.0 and found[0] < best[0]:

@@ -2,9 +2,10 @@
 
 A table is a grid of cells over the values of these joints, 2^L along each axis. Each cell holds a lower bound of the
 distance for all values in it, in units of UNIT, as one byte; 0 where the bodies are not proved apart, and 1 where they
-are, by THIN at least: bearings are so near. Coarser grids follow, each with half as many cells along each axis, whose
-cells hold the least value of those that they consist of. A box of joint values is looked up in the finest grid of which
-it meets at most ACROSS cells along each axis. The cells of a continuous joint are those of a whole turn, which repeat.
+are, by THIN at least. Bearings are so near at all values of their joint, and do not count for a least clearance.
+Coarser grids follow, each with half as many cells along each axis, whose cells hold the least value of those that they
+consist of. A box of joint values is looked up in the finest grid of which it meets at most ACROSS cells along each
+axis. The cells of a continuous joint are those of a whole turn, which repeat.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from apex_ompl.kernel.compiled.layout import Floats
 UNIT = 1e-4  # of the bounds [m]
 THIN = 1e-5  # bound that 1 stands for [m]
 LARGEST = 255  # bound in these units
+BEARING = -2  # stands for the second joint of a table of a bearing, which has one
 ACROSS = 4  # most cells along an axis that are read
 MOST_CELLS = 1e9  # from the first one, of a continuous joint
 
@@ -125,3 +127,16 @@ def clearance_of_box(t: RobotArrays, k: int, q: Floats, half_width: Floats) -> f
             for m in range(f, g + 1):
                 least = min(least, _value(t, place + (m & (columns - 1))))
     return _bound(least)
+
+
+@inlined
+def is_bearing(t: RobotArrays, k: int, bound: float) -> bool:
+    """Whether a bound by the table of pair ``k`` is that of a bearing."""
+    return bound == THIN and t.table_joints[t.bodies_table[k], 1] == BEARING
+
+
+@inlined
+def proved_by_table(t: RobotArrays, k: int, q: Floats, half_width: Floats, margin: float) -> bool:
+    """Whether its table proves pair ``k`` apart over a box of states, by a margin unless it is a bearing."""
+    bound = clearance_of_box(t, k, q, half_width)
+    return bound > margin or is_bearing(t, k, bound)

@@ -4,8 +4,9 @@ Intervals of the curve are bisected, breadth first. On each the sphere covers ar
 The few pairs that they leave are bounded by their exact shapes
 (:func:`apex_ompl.kernel.compiled.check.pair_distance.pair_bound`); a pair that is not decided goes on to the two halves
 of the interval, alone. Bounds are compared with a margin: 0 for a bare proof; for the least clearance c it is a limit,
-or the least distance found so far less a tolerance, so that in the end margin <= c <= found. A pair that is nearer than
-``touch`` at a state in the middle of an interval counts as touching.
+or the least distance found so far less a tolerance, so that in the end margin <= c <= found. Bearings do not count for
+it (:mod:`apex_ompl.kernel.compiled.check.clearance_table`). A pair that is nearer than ``touch`` at a state in the
+middle of an interval counts as touching.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple
 
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
+from apex_ompl.kernel.compiled.check.clearance_table import proved_by_table
 from apex_ompl.kernel.compiled.check.curve import set_motion, set_state
 from apex_ompl.kernel.compiled.check.pair_distance import pair_bound
 from apex_ompl.kernel.compiled.check.relative_motion import Frames
@@ -148,6 +150,27 @@ def _left_by_spheres(
 
 
 @inlined
+def _by_table(t: RobotArrays, q: Floats, half_width: Floats, a: int, b: int, margin: float) -> bool:
+    """Whether two bodies have a table that proves them apart over a box of states, by a margin unless a bearing."""
+    for k in range(len(t.bodies)):
+        if t.bodies_table[k] >= 0 and t.bodies[k, 0] == a and t.bodies[k, 1] == b:
+            return proved_by_table(t, k, q, half_width, margin)
+    return False
+
+
+@inlined
+def _left_by_tables(t: RobotArrays, w: Workspace, p: ProofBuffers, count: int) -> int:
+    """Keep of ``count`` pairs in ``found`` those that no table proves, and return their number."""
+    left = 0
+    for m in range(count):
+        x, y = p.found[m, 0], p.found[m, 1]
+        if y < 0 or not _by_table(t, p.state, w.half_width, x, y, p.figures[MARGIN]):
+            p.found[left, 0], p.found[left, 1] = x, y
+            left += 1
+    return left
+
+
+@inlined
 def _by_shapes(
     t: RobotArrays, w: Workspace, h: ShapeArrays, rows: Integers, g: PairBuffers, p: ProofBuffers,
     a: float, b: float, count: int, shortest: float, touch: float, tolerance: float,
@@ -218,6 +241,8 @@ def prove_curve(
             count = _left_by_spheres(t, s, w, p, a, b, shortest)
             if count < 0:
                 return UNDECIDED
+        if len(t.table_joints):
+            count = _left_by_tables(t, w, p, count)
         outcome = _by_shapes(t, w, h, rows, g, p, a, b, count, shortest, touch, tolerance)
         if outcome != PROVED:
             return outcome

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 
 from apex_ompl.kernel.compiled.arrays import GRID, LIMIT_SLACK, RUN, RobotArrays, SceneArrays
-from apex_ompl.kernel.compiled.check.clearance_table import clearance_of_box
+from apex_ompl.kernel.compiled.check.clearance_table import proved_by_table
 from apex_ompl.kernel.compiled.compilation import inlined
 from apex_ompl.kernel.compiled.geometry.bounding_trees import items_apart
 from apex_ompl.kernel.compiled.geometry.grid_distance import FARTHER, compare
@@ -229,7 +229,7 @@ def unproved_of_pair(t: RobotArrays, w: Workspace, q: Floats, p: int, found: Int
         apart = t.node_radius[t.body_root[m]] + t.node_radius[t.body_root[n]] + shift
         if (u[0] - v[0]) ** 2 + (u[1] - v[1]) ** 2 + (u[2] - v[2]) ** 2 > apart * apart:
             continue
-        if t.bodies_table[k] >= 0 and clearance_of_box(t, k, q, w.half_width) > w.margin[0]:
+        if t.bodies_table[k] >= 0 and proved_by_table(t, k, q, w.half_width, w.margin[0]):
             continue
         if not bodies_clear(t, w, m, n, shift):
             found[count, 0], found[count, 1] = m, n
