@@ -3,8 +3,9 @@
 Each cell is planned as a whole, without going back (the nearest goal of each motion is taken, and the cell is lost
 where it does not suit the later steps), without blends, as MoveIt does it, with OMPL's RRTConnect for
 the motions between the same stages, and with steps of both arms at once. Times are processor times of one process with
-a kept planner; the first cell of each kind is left out of them, and named beside them. What a cell loads stays loaded
-for the rows after the first, so that rows come first by turns. Each run is stored in benchmarks/runs/cells when it
+a kept planner, without the first cell of each kind. What a cell loads stays loaded for the rows after the first, so
+that rows come first by turns. First cells are planned in a new process each, ten of a kind, without the time of
+imports. Each run is stored in benchmarks/runs/cells when it
 ends; the command resumes where it was stopped.
 
 Usage: python -m benchmarks.planners.cells [-n 100] [--first 1000] [--timeout 60] [--kind stacking]
@@ -15,8 +16,10 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import product
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -39,6 +42,8 @@ ROWS = {
 }  # fmt: skip
 COMPARED = "sequence", "without blends"  # by their makespans
 MOST_CAUSES = 4  # that a table names
+FIRST = "first"  # row of cells that are planned in a new process
+FRESH = 10  # of them
 
 
 def without_blends(problem: Problem) -> Problem:
@@ -55,7 +60,8 @@ def made(planner: MotionPlanner, kind: str, row: str, seed: int, timeout: float)
     cell = cells.draw(kind, seed)
     cell = without_blends(cell) if row == "without blends" else cell
     begin = time.process_time()
-    result = planner.plan_task(cell, RIVAL if row == RIVAL else None, timeout=timeout, seed=seed, search=ROWS[row])
+    search, name = ROWS.get(row, TaskSearch()), RIVAL if row == RIVAL else None
+    result = planner.plan_task(cell, name, timeout=timeout, seed=seed, search=search)
     spent = time.process_time() - begin
     return {
         "kind": kind, "row": row, "seed": seed, "solved": bool(result), "status": str(result.status), "cpu_s": spent,
@@ -73,7 +79,8 @@ def _clearance(value: float) -> float | None:
 def table(runs: Sequence[dict[str, Any]]) -> str:
     """Return the table of kinds and rows, and what failed how often."""
     head = [
-        "cells", "row", "solved", "planning CPU s p50", "p95", "first", "makespan s p50", "p95", "choices examined p50",
+        "cells", "row", "solved", "planning CPU s p50", "p95", "first cells p50", "makespan s p50", "p95",
+        "choices examined p50",
     ]  # fmt: skip
     lines, causes = [head, ["---", "---", *["---:"] * (len(head) - 2)]], list[str]()
     for kind in dict.fromkeys(run["kind"] for run in runs):
@@ -85,7 +92,8 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
             spent = record.percentiles([r["cpu_s"] for r in mine[1:]], 50, 95)
             makespans = record.percentiles([r["makespan_s"] for r in mine if r["seed"] in both and r["solved"]], 50, 95)
             examined = record.percentiles([r["examined"] for r in mine], 50)[0]
-            first = mine[0]["cpu_s"] if mine else float("nan")
+            fresh = [r["cpu_s"] for r in runs if (r["kind"], r["row"]) == (kind, FIRST)] if row == COMPARED[0] else []
+            first = record.percentiles(fresh, 50)[0] if fresh else float("nan")
             solved = f"{sum(r['solved'] for r in mine)}/{len(mine)}"
             times = [f"{x:.2f}" for x in (*spent, first, *makespans)]
             lines.append([kind, row, solved, *times, f"{examined:.0f}"])
@@ -109,19 +117,32 @@ def main() -> None:
     args = parser.parse_args()
     kinds, runs = args.kind or cells.names(), list[dict[str, Any]]()
     FOLDER.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as pool:
+        for kind, seed in product(kinds, range(args.first, args.first + min(args.n, FRESH))):
+            runs.append(_stored(kind, FIRST, seed, lambda *given: pool.submit(first, *given).result(), args.timeout))
     for seed in range(args.first, args.first + args.n):
-        first = seed % len(ROWS)
+        turn = seed % len(ROWS)
         for kind in kinds:
-            for row in [*ROWS][first:] + [*ROWS][:first]:
-                file = FOLDER / f"{kind}-{row.replace(' ', '_')}-{seed}.json"
-                if not file.exists():
-                    run = made(_planner(kind), kind, row, seed, args.timeout)
-                    write_atomically(file, json.dumps(run).encode())
-                runs.append(json.loads(Path(file).read_text()))
+            for row in [*ROWS][turn:] + [*ROWS][:turn]:
+                runs.append(_stored(kind, row, seed, lambda *given: made(_planner(given[0]), *given), args.timeout))
     seeds, commits = f"{args.first}-{args.first + args.n - 1}", "; ".join(sorted({run["commit"] for run in runs}))
     record.write(
         "cells", {"runs": runs}, table(runs), N=args.n, seeds=seeds, timeout=args.timeout, run_commits=commits
     )  # fmt: skip
+
+
+def first(kind: str, row: str, seed: int, timeout: float) -> dict[str, Any]:
+    """Return what a run gave as the first one of this process."""
+    return made(MotionPlanner(cells.draw(kind, seed).robot), kind, row, seed, timeout)
+
+
+def _stored(kind: str, row: str, seed: int, make: Callable[..., dict[str, Any]], timeout: float) -> dict[str, Any]:
+    """Return a run, which is made where its file is missing."""
+    file = FOLDER / f"{kind}-{row.replace(' ', '_')}-{seed}.json"
+    if not file.exists():
+        write_atomically(file, json.dumps(make(kind, row, seed, timeout)).encode())
+    found: dict[str, Any] = json.loads(file.read_text())
+    return found
 
 
 _planners: dict[str, MotionPlanner] = {}

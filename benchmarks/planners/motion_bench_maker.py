@@ -15,14 +15,12 @@ Usage: python -m benchmarks.planners.motion_bench_maker FOLDER [-n 30] [--jobs 1
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from apex_ompl.api import load_problem
 from apex_ompl.errors import MissingFileError
@@ -34,20 +32,21 @@ from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import path_length
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.moveit import convert
-from apex_ompl.scene.problem import Problem
 from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import dump_yaml, read_yaml
-from benchmarks.lib import record
+from benchmarks.lib import record, vamp_world
 from benchmarks.planners import peers
 
-try:
-    import vamp
-except ImportError as error:
-    sys.exit(f"motion_bench_maker.py: error: no VAMP ({error}), expected: pip install vamp-planner")
-
-DEPENDS = ("@benchmark", "benchmarks/planners/peers.py", "apex_ompl/goals", "apex_ompl/robot/data/baxter.robot.yaml")
+vamp = vamp_world.library()
+DEPENDS = (
+    "@benchmark",
+    "benchmarks/planners/peers.py",
+    "benchmarks/lib/vamp_world.py",
+    "apex_ompl/goals",
+    "apex_ompl/robot/data/baxter.robot.yaml",
+)
 FOLDER = Path(__file__).parents[1] / "runs" / "motion_bench_maker"
 DATA = record.ROOT / "apex_ompl" / "robot" / "data"
 SETS = ("easy", "medium", "hard")
@@ -67,23 +66,6 @@ ROWS = (
 )
 
 
-def environment(problem: Problem) -> Any:
-    """Return VAMP's environment of a problem: boxes, and capsules around cylinders, as its own problems have them."""
-    made = vamp.Environment()
-    for body in problem.scene:
-        angles = Rotation.from_quat(body.orientation).as_euler("xyz").tolist()
-        place = list(body.position)
-        if body.box is not None:
-            made.add_cuboid(vamp.Cuboid(place, angles, [0.5 * size for size in body.box]))
-        elif body.cylinder is not None:
-            made.add_capsule(vamp.Cylinder(place, angles, body.cylinder.radius, body.cylinder.length))
-        elif body.sphere is not None:
-            made.add_sphere(vamp.Sphere(place, body.sphere.radius))
-        else:
-            raise ValueError(f"{body.name} has a shape that VAMP has not")
-    return made
-
-
 def agreement(ready: PlanningSetup, made: Any, rng: np.random.Generator) -> list[int]:
     """Return the numbers of random states: free to both, colliding, free to VAMP alone, to the checker alone."""
     ends, limits = np.stack([ready.start, ready.goals[0]]), ready.robot.limits
@@ -100,7 +82,7 @@ def plan_with_vamp(job: Job) -> Run:
     Parameters of the job are those of its ``RRTCSettings``, whose defaults hold otherwise.
     """
     problem = load_problem(job.problem)
-    ready, made = assemble(problem), environment(problem)
+    ready, made = assemble(problem), vamp_world.environment(problem)
     same = agreement(ready, made, np.random.default_rng(job.seed))
     settings, rng = vamp.RRTCSettings(), vamp.baxter.halton()
     settings.range, settings.max_iterations, settings.max_samples = RANGE, ITERATIONS, ITERATIONS

@@ -25,7 +25,7 @@ from apex_ompl.util.schema import read_json
 from benchmarks.lib import record
 
 PLANNERS = {"apex": {"model": "none"}, "rrtconnect+polish": {}}
-TIMEOUT = 30.0  # of a call, by the wall clock of a machine that does other things too [s]
+TIMEOUT = 10.0  # of a call, by the wall clock of a machine that does other things too [s]
 SOON = 1.0  # [s]
 SAMPLES, SEED = 2000, 7  # states of the shares
 BUDGET, JOBS = 300.0, 2  # of a preparation

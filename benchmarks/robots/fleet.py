@@ -46,6 +46,12 @@ CELLS = {
     "dual_ur5": Cell(*UR5, ((0.0, 0.5, 0.0, 0.0), (0.0, -0.5, 0.0, 0.0))),
     "dual_panda": Cell(*PANDA, ((0.0, 0.4, 0.0, 0.0), (0.0, -0.4, 0.0, 0.0))),
     "three_xarm7": Cell(*XARM7, ((0.0, 0.6, 0.0, 0.0), (0.0, -0.6, 0.0, 0.0), (0.9, 0.0, 0.0, math.pi))),
+    "four_xarm7": Cell(
+        *XARM7,
+        ((0.0, 0.5, 0.0, 0.0), (0.0, -0.5, 0.0, 0.0), (0.9, 0.5, 0.0, math.pi), (0.9, -0.5, 0.0, math.pi)),
+    ),
+        *XARM7, ((0.0, 0.5, 0.0, 0.0), (0.0, -0.5, 0.0, 0.0), (0.9, 0.5, 0.0, math.pi), (0.9, -0.5, 0.0, math.pi))
+    ),
     "pr2": Cell(*PR2),
     "pr2_torso": Cell(*PR2, torso="torso_lift_joint"),
     "tiago_pro": Cell("tiago_pro_description/robots/tiago_pro.urdf"),

@@ -4,21 +4,28 @@ The problems (Chamzas et al. 2022), URDFs, SRDFs and meshes are those of VAMP's 
 whose folder ``resources`` is given, its ``problems.tar.bz2`` unpacked. Robots are set up by ``apex-ompl robot new``
 from them, the Fetch with its torso, locked joints as at the start of the first problem, and prepared by
 ``apex-ompl robot prepare``. Meshes decide. Problems whose start or goal the meshes refuse are left out and counted.
-Those of Baxter are in benchmarks/planners/motion_bench_maker.py. Times and columns are those of
+Those of Baxter are in benchmarks/planners/motion_bench_maker.py. With --vamp VAMP plans them, too, whose robots are
+spheres of its own, and has as many iterations as it wants; its shortened paths are then proved by the meshes here, and
+not repaired. Times and columns are those of
 :mod:`benchmarks.robots.any_robot`; figures are kept in benchmarks/runs/mbm.
 
-Usage: python -m benchmarks.robots.motion_bench_maker RESOURCES [ROBOT...] [-n 100] [--budget 300] [--folder FOLDER]
+Usage: python -m benchmarks.robots.motion_bench_maker RESOURCES [ROBOT...] [-n 100] [--vamp] [--folder FOLDER]
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import MissingFileError
+from apex_ompl.paths.path import path_length
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.moveit import convert
 from apex_ompl.robot.new import new_robot, sources_of
@@ -27,14 +34,15 @@ from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import read_text, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_yaml
 from apex_ompl.util.validation import check_name
-from benchmarks.lib import record
+from benchmarks.lib import record, vamp_world
 from benchmarks.robots import figures
 
-DEPENDS = ("@planning", "benchmarks/robots/figures.py")
+DEPENDS = ("@planning", "benchmarks/robots/figures.py", "benchmarks/lib/vamp_world.py")
 FOLDER = Path(__file__).parents[1] / "runs" / "mbm"
 ROBOTS = ("panda", "ur5", "fetch")
 PACKAGES = {"fetch": "fetch_description"}
 SMALLER = {"fetch": "arm"}  # groups of the SRDF whose joints are part of the group that is planned
+Problems = Mapping[str, Problem | None]
 GROUP = r'<group name="{}">.*?</group>'
 
 
@@ -84,11 +92,47 @@ def problems(robot: Path, resources: Path, most: int) -> Iterator[tuple[str, Pro
         yield f"{request.parent.name}/{request.stem}", found if free else None
 
 
+def run_vamp(mine: figures.Figures, robot: str, names: Iterable[str], found: Callable[[], Problems]) -> None:
+    """Let VAMP plan for the problems that are missing."""
+    done: dict[str, Any] = mine.data.setdefault("vamp", {})
+    loaded = load_robot(mine.robot)
+    for name in names:
+        if name in done:
+            continue
+        problem, times = found()[name], dict[str, float]()
+        assert problem is not None
+        ends = problem.start_state(loaded.joint_names), problem.goal_states(loaded.joint_names)[0]
+        made = vamp_world.environment(problem)
+        path = vamp_world.planned(robot, ends, loaded.joint_names, made, times)
+        checker = CollisionChecker(loaded, problem.scene, problem.attached, problem.allowed)
+        proved = path is not None and bool(checker.prove(path))
+        length = None if path is None else path_length(path)
+        done[name] = {"found": path is not None, "proved": proved, "length": length, "s": sum(times.values())}
+    mine.write(vamp=done)
+
+
+def vamp_table(rows: Mapping[str, tuple[figures.Figures, list[str]]]) -> str:
+    """Return a table of VAMP's runs."""
+    head = ["VAMP", "N", "found by its spheres", "free by the meshes", "ms p50", "p95", "length rad"]
+    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
+    for robot, (mine, names) in rows.items():
+        runs = [mine.data["vamp"][name] for name in names]
+        times = [1e3 * t for t in record.percentiles([run["s"] for run in runs if run["found"]], 50, 95)]
+        both = [
+            name for name in names if mine.data["vamp"][name]["found"] and mine.data["runs"][name]["apex"]["solved"]
+        ]
+        length = record.percentiles([mine.data["vamp"][name]["length"] for name in both], 50)[0]
+        shares = [f"{np.mean([run[key] for run in runs]):.3f}" for key in ("found", "proved")]
+        lines.append(record.row([robot, len(runs), *shares, *(f"{t:.2f}" for t in times), f"{length:.2f}"]))
+    return "\n".join(lines)
+
+
 def main() -> None:
     """Set up, prepare, plan and write."""
     parser = record.parser(__doc__, n=100, of="problems of a robot")
     parser.add_argument("resources", type=Path, help="folder resources of VAMP's repository")
     parser.add_argument("robots", nargs="*", help=f"by default all of {', '.join(ROBOTS)}")
+    parser.add_argument("--vamp", action="store_true", help="let VAMP plan, too")
     figures.add_options(parser, FOLDER)
     args = parser.parse_args()
     rows, refused = {}, {}
@@ -104,10 +148,19 @@ def main() -> None:
         names = [f"{path.parent.name}/{path.stem}" for path in requests(robot, args.resources)[: args.n]]
         names, refused[robot] = [name for name in names if name not in gone], len(gone & {*names})
         mine.run(names, lambda name, found=found: found()[name])
+        if args.vamp:
+            run_vamp(mine, robot, names, found)
         rows[robot] = mine, names
     left = ", ".join(f"{robot} {count}" for robot, count in refused.items())
     settings = {"n": args.n, "budget": args.budget, "refused": left, **figures.SETTINGS}
-    record.write("motion_bench_maker_robots", *figures.table(rows), **settings)
+    data, table = figures.table(rows)
+    if all("vamp" in mine.data for mine, _ in rows.values()):
+        data["vamp"] = {
+            robot: {name: mine.data["vamp"][name] for name in names} for robot, (mine, names) in rows.items()
+        }
+        table = f"{table}\n\n{vamp_table(rows)}"
+        settings["vamp"] = version("vamp-planner")
+    record.write("motion_bench_maker_robots", data, table, **settings)
 
 
 if __name__ == "__main__":
