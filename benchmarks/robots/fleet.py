@@ -50,8 +50,6 @@ CELLS = {
         *XARM7,
         ((0.0, 0.5, 0.0, 0.0), (0.0, -0.5, 0.0, 0.0), (0.9, 0.5, 0.0, math.pi), (0.9, -0.5, 0.0, math.pi)),
     ),
-        *XARM7, ((0.0, 0.5, 0.0, 0.0), (0.0, -0.5, 0.0, 0.0), (0.9, 0.5, 0.0, math.pi), (0.9, -0.5, 0.0, math.pi))
-    ),
     "pr2": Cell(*PR2),
     "pr2_torso": Cell(*PR2, torso="torso_lift_joint"),
     "tiago_pro": Cell("tiago_pro_description/robots/tiago_pro.urdf"),
