@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -124,18 +125,11 @@ class TaskRunner:
             seed: Seed of the plans.
             place: How far objects may be off [m].
         """
-        found = list[TaskResult]()
+        found, make = list[TaskResult](), partial(self._planner.plan_task, known, timeout=self.timeout)
         for k in range(PLANS):
-            found.append(
-                self._planner.plan_task(
-                    known,
-                    timeout=self.timeout,
-                    seed=seed + k * SEEDS,
-                    constraints=self._level(known),
-                    search=self.search,
-                )  # fmt: skip
-            )
-            if found[-1] and found[-1].steps[0].clearance >= place:
+            plan = make(seed=seed + k * SEEDS, constraints=self._level(known), search=self.search)
+            found.append(plan)
+            if plan and plan.steps[0].clearance >= place:
                 break
         return max(found, key=lambda plan: plan.steps[0].clearance if plan else -1.0)
 

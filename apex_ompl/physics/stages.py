@@ -102,7 +102,7 @@ def _at_once(robot: Robot, plan: TaskResult) -> Iterator[Stage]:
     for start, end in pairwise([-np.inf, *stops]):
         begin = max(start, 0.0)
         during = [one for one in plan.steps if one.start < end - SAME and one.end > begin + SAME]
-        planned = during or [plan.step_at(end)]
+        planned = during or [plan.steps[0]]  # as nothing lasts before a stop at 0
         motion, there, times = from_rest_to_rest(plan.trajectory, begin, end, robot.limits)
         slow = 1.0 / min(_gentle_speed(robot, plan.problem, one.attached, motion) for one in planned)
         begun = [

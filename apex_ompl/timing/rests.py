@@ -17,7 +17,7 @@ AT_REST = 1e-6
 """Largest velocity of a joint at rest [rad/s]."""
 SPACING = 0.008  # of knots where a motion comes to rest [s]
 COMING = (0.2, 0.3, 0.45, 0.7, 1.0, 1.5)  # times in which it does [s]
-SLOWER = (1.0, 1.25, 1.6, 2.0, 3.0, 5.0, 8.0)  # factors of its duration
+SLOWER = tuple(1.25**k for k in range(32))  # factors of its duration
 DEVIATION = 2e-3  # from the path [rad]
 
 

@@ -16,7 +16,7 @@ from apex_ompl.cli.parser import main
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import ParameterError
 from apex_ompl.physics import execute
-from apex_ompl.physics.stages import stages
+from apex_ompl.physics.stages import intended, stages
 from apex_ompl.planning import TaskSearch, task_overlaps
 from apex_ompl.planning.task_motion import task_fault
 from apex_ompl.planning.task_overlaps import PlacedStep, overlapped
@@ -234,3 +234,26 @@ def test_steps_at_once_are_executed_in_physics_with_stops_where_hands_close() ->
     assert sum(stage.motion.duration for stage in parts) < 1.3 * result.trajectory.duration
     first = made("handover", 2003, False)
     assert run.metrics["duration"] < execute(first).metrics["duration"]
+
+
+def test_what_is_let_go_at_once_is_let_go_before_anything_moves() -> None:
+    with MotionPlanner() as planner:
+        place = {"position": (0.0, 0.0, 0.2), "box": (0.05, 0.05, 0.05), "touch_links": ["left_hand_palm"]}
+        planner.world.attach({"name": "box", "link": "left_hand_palm", **place})
+        sides = [("left", 0.5), ("right", -0.5)]
+        goals = {side: PoseTarget(frame=f"{side}_hand", position=(0.4, y, 0.6)) for side, y in sides}
+        steps: list[Any] = [{"kind": "move", "goal": goals[side], "group": f"{side}_arm"} for side, _ in sides]
+        result = planner.sequence(
+            "home", [{"kind": "detach", "object": "box"}, *steps], timeout=SECONDS, search=AT_ONCE
+        )
+        robot = planner.robot
+    assert result and result.schedule, result.reason
+    first, *_ = parts = stages(robot, result)
+    assert [step.title for step in first.done] == ["detach box"] and first.motion.duration == 0.0
+    assert [one.name for one in first.attached] == ["box"] and not parts[-1].attached
+    box = intended(robot, parts)["box"]
+    assert not box.link and np.allclose(
+        box.pose,
+        robot.link_pose(robot.home, "left_hand_palm")
+        @ np.block([[np.eye(3), np.array([[0], [0], [0.2]])], [0, 0, 0, 1]]),
+    )

@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from apex_ompl.errors import ParameterError
@@ -29,6 +29,7 @@ def motion(seed: int) -> Trajectory:
 
 
 @settings(max_examples=40, deadline=None)
+@example(0, 0.4, 0.002)  # some milliseconds
 @given(st.integers(0, 3), st.floats(0.0, 0.9), st.floats(0.02, 1.0))
 def test_a_part_is_at_rest_at_its_ends_within_the_limits_and_on_the_path(seed: int, start: float, share: float) -> None:
     whole = motion(seed)
