@@ -1,6 +1,7 @@
 """Goals of which any will do: poses, such as grasps of an object, alignments and joint configurations.
 
-A few descents of inverse kinematics for each goal find those that can be reached soon. These are then sampled as a goal
+A few descents of inverse kinematics for each goal find those that can be reached soon; poses of arms without a common
+joint are reached one by one, and combined. These are then sampled as a goal
 alone is (:mod:`apex_ompl.goals.goal_sampling`), and the states that are nearest in time are returned. A pose with a
 region is a goal of this kind as well: poses that are drawn in the region.
 """
@@ -8,7 +9,7 @@ region is a goal of this kind as well: poses that are drawn in the region.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 ANY = "goal"  # error term: 0 where a goal is reached, else the least error relative to the bounds
 DESCENTS = 1024  # of the first search, for all goals together, within the numbers for each
 LEAST_DESCENTS, MOST_DESCENTS = 4, 32  # for each
+OF_ARM = 4  # states of an arm at a pose that are combined with those of others
 EXAMINED = 4  # goals that are sampled in full: those with the nearest free states
 UNTRIED = 12  # the same where the first search found no free state
 SHARE = 2  # states that are returned, as a multiple of those for a goal alone
@@ -53,6 +55,20 @@ class _First(NamedTuple):
     attempts: int
     converged: int
     blocked: str
+
+
+class _OfArm(NamedTuple):
+    """States in which an arm reaches a pose, the nearest ones.
+
+    Attributes:
+        free: Numbers of the joints of the arm.
+        states: Shape (N, dof).
+        durations: Durations to them, shape (N,) [s].
+    """
+
+    free: NDArray[np.intp]
+    states: Array
+    durations: Array
 
 
 class AnyGoal:
@@ -184,35 +200,85 @@ class AnyGoal:
 
     def _first(self, checker: CollisionChecker, rng: np.random.Generator) -> _First:
         """Return free states by a few descents for each goal, and the goals to be sampled in full."""
-        least = np.full(len(self.members), np.inf)  # duration to the nearest free state of each goal [s]
-        reached = np.zeros(len(self.members), bool)
-        states, counts, attempts, converged, blocked = [self.states], dict[int, int](), 0, len(self.states), ""
-        each = int(np.clip(DESCENTS // max(len(self.members), 1), LEAST_DESCENTS, MOST_DESCENTS))
-        for k, goal in enumerate(self.members):
-            seeds = np.tile(self.start, (each, 1))
-            noise = rng.normal(size=(each, len(goal.inverse.free)))
-            seeds[:, goal.inverse.free] += np.linspace(0.0, single.FARTHEST, each)[:, None] * noise
-            ends = goal.inverse.descend(
-                seeds.clip(self.robot.limits.lower, self.robot.limits.upper),
-                tolerance=single.TOLERANCE, max_steps=single.DESCENT_STEPS,
-            )  # fmt: skip
-            attempts += each
-            there = self.robot.turned_to(ends.states[ends.errors <= 10.0 * single.TOLERANCE], self.start)
+        known = dict[Hashable, _OfArm]()
+        found, attempts = list[Array](), 0
+        for goal, parts in zip(self.members, self._separate, strict=True):
+            if parts:
+                for key, part in parts.items():
+                    if key not in known:
+                        tried, there = self._descended(part, self._count, rng)
+                        states = self._nearest(there, OF_ARM)
+                        known[key] = _OfArm(part.inverse.free, states, self._durations(states))
+                        attempts += tried
+                there = self._combined([known[key] for key in parts])
+            else:
+                tried, there = self._descended(goal, len(self.members), rng)
+                attempts += tried
             if isinstance(goal, PoseGoal) and not goal.residual_decides:
                 there = there[[within(goal.errors(q), goal.bounds) for q in there]]
-            converged += len(there)
-            reached[k] = len(there) > 0
-            free = there[checker.are_free(there)] if len(there) else there
-            if len(free):
-                least[k] = float(self._durations(free).min())
-                states.append(free)
-                counts[k] = len(free)
+            found.append(there)
+        reached = np.array([len(there) > 0 for there in found], bool)
+        states = np.concatenate([self.states[:0], *found])
+        member = np.repeat(np.arange(len(found)), [len(there) for there in found])
+        free = checker.are_free(states) if len(states) else np.zeros(0, bool)
+        states, members = states[free], member[free]
+        least = np.full(len(self.members), np.inf)  # duration to the nearest free state of each goal [s]
+        np.minimum.at(least, members, self._durations(states))
+        converged, blocked = len(self.states) + len(member), ""
         free = self.states[[checker.is_free(q) for q in self.states]]
         if len(self.states) and not len(free):
             blocked = str(next(iter(checker.contacts(self.states[0])), "in collision"))
         order = np.lexsort([least, ~reached])[: EXAMINED if np.isfinite(least).any() else UNTRIED]
-        members = np.repeat([-1, *counts], [len(free), *counts.values()])
-        return _First(np.concatenate([free, *states[1:]]), members, order.tolist(), attempts, converged, blocked)
+        members = np.concatenate([np.full(len(free), -1), members])
+        return _First(np.concatenate([free, states]), members, order.tolist(), attempts, converged, blocked)
+
+    def _descended(
+        self, goal: PoseGoal | AlignmentGoal, among: int, rng: np.random.Generator
+    ) -> tuple[int, Array]:  # fmt: skip
+        """Return the number of descents from near the start for one of some goals, and the states that reach it."""
+        each = int(np.clip(DESCENTS // max(among, 1), LEAST_DESCENTS, MOST_DESCENTS))
+        seeds, free = np.tile(self.start, (each, 1)), goal.inverse.free
+        seeds[:, free] += np.linspace(0.0, single.FARTHEST, each)[:, None] * rng.normal(size=(each, len(free)))
+        ends = goal.inverse.descend(
+            seeds.clip(self.robot.limits.lower, self.robot.limits.upper),
+            tolerance=single.TOLERANCE, max_steps=single.DESCENT_STEPS,
+        )  # fmt: skip
+        return each, self.robot.turned_to(ends.states[ends.errors <= 10.0 * single.TOLERANCE], self.start)
+
+    @cached_property
+    def _separate(self) -> list[dict[Hashable, PoseGoal]]:
+        """For each goal whose poses are of arms without a common joint, goals of single poses; for others nothing."""
+        known, apart = dict[Hashable, PoseGoal](), dict[Hashable, bool]()
+        found = list[dict[Hashable, PoseGoal]]()
+        for goal in self.members:
+            found.append({})
+            if not isinstance(goal, PoseGoal) or len(goal.poses) < 2 or not apart.get(goal.where, True):
+                continue
+            keys = list(zip(goal.where, goal.poses, goal.drawn_poses, strict=True))
+            parts: dict[Hashable, PoseGoal] = {key: known.get(key) or goal.of_one(k) for k, key in enumerate(keys)}
+            known |= parts
+            if goal.where not in apart:
+                joints = [k for part in parts.values() for k in part.inverse.free.tolist()]
+                apart[goal.where] = len({*joints}) == len(joints)
+            if apart[goal.where]:
+                found[-1] = parts
+        return found
+
+    @cached_property
+    def _count(self) -> int:
+        """Number of single poses of separate arms."""
+        return len({key for parts in self._separate for key in parts})
+
+    def _combined(self, found: Sequence[_OfArm]) -> Array:
+        """Return states of all arms from states of each, the nearest in time, shape (N, dof)."""
+        durations = np.zeros(())
+        for one in found:
+            durations = np.maximum(durations[..., None], one.durations)
+        chosen = np.argsort(durations, axis=None, kind="stable")[:LEAST_DESCENTS]
+        states = np.tile(self.start, (len(chosen), 1))
+        for one, numbers in zip(found, np.unravel_index(chosen, durations.shape), strict=True):
+            states[:, one.free] = one.states[numbers][:, one.free]
+        return states
 
     def _durations(self, states: Array) -> Array:
         return direct_durations(self.start, states, self.robot.limits)

@@ -70,6 +70,15 @@ class PoseGoal:
         other.__dict__.pop("inverse", None)
         return other
 
+    @property
+    def drawn_poses(self) -> tuple[PoseTarget, ...]:
+        """The poses that inverse kinematics is to reach: those of the goal, or drawn inside of its regions."""
+        return self._drawn
+
+    def of_one(self, k: int) -> PoseGoal:
+        """Return the goal of one of the poses alone."""
+        return PoseGoal(self.robot, [self.poses[k]], self._attached, self.start).drawn([self._drawn[k]])
+
     @cached_property
     def inverse(self) -> IKSolver:
         """Inverse kinematics of the poses; hands stay as they are."""

@@ -43,9 +43,9 @@ def hand_pose(robot: Robot, q: np.ndarray, hand: str = "left_hand") -> pin.SE3:
     return data.oMf[robot.model.getFrameId(record.palm)] * pin.SE3(np.eye(3), np.array(record.point))
 
 
-def target(pose: pin.SE3, **fields: Any) -> PoseTarget:
+def target(pose: pin.SE3, frame: str = "left_hand", **fields: Any) -> PoseTarget:
     xyzw = tuple(pin.Quaternion(pose.rotation).coeffs())
-    return PoseTarget(frame="left_hand", position=tuple(pose.translation), orientation=xyzw, **fields)
+    return PoseTarget(frame=frame, position=tuple(pose.translation), orientation=xyzw, **fields)
 
 
 def wanted_pose(pose: PoseTarget) -> pin.SE3:
@@ -73,6 +73,44 @@ def test_the_nearest_of_many_poses_is_about_as_near_as_the_best_of_them_alone(ro
     alone = [sample(goal, checker, np.random.default_rng(0)).states for goal in goals]
     best = min(direct_durations(robot.home, one, robot.limits).min() for one in alone if len(one))
     assert direct_durations(robot.home, found, robot.limits).min() < 1.2 * best
+
+
+def test_pairs_of_poses_of_two_arms_are_reached_by_descents_of_each(robot: Robot) -> None:
+    rng = np.random.default_rng(7)
+    states = (robot.home + rng.normal(0.0, 0.4, (12, robot.dof))).clip(robot.limits.lower, robot.limits.upper)
+    hands = {name: [hand_pose(robot, q, name) for q in states] for name in ("left_hand", "right_hand")}
+    pairs = [(a, b) for a in range(12) for b in range(12)]
+    poses = [[target(hands[name][k], name) for name, k in zip(hands, pair, strict=True)] for pair in pairs]
+    goal = AnyGoal(robot, [PoseGoal(robot, pair, (), robot.home) for pair in poses], np.empty((0, 16)), robot.home)
+    checker = CollisionChecker(robot, proofs=False)
+    found = goal._first(checker, np.random.default_rng(0))
+    assert found.attempts <= 24 * 32  # and not some for each of the 144 pairs
+    assert len({*found.members.tolist()}) > 72 and checker.are_free(found.states).all()
+    for q, k in zip(found.states, found.members, strict=True):
+        for name, number in zip(hands, pairs[k], strict=True):
+            off = pin.log6(hands[name][number].actInv(hand_pose(robot, q, name)))
+            assert np.abs(off.vector).max() < 1e-3
+        assert np.array_equal(q[14:], robot.home[14:])
+    assert goal.member_of(found.states[0]) == found.members[0]
+
+
+def test_two_poses_of_one_arm_are_reached_together(robot: Robot) -> None:
+    states = (robot.home + np.random.default_rng(3).normal(0.0, 0.2, (4, robot.dof))).clip(
+        robot.limits.lower, robot.limits.upper
+    )
+    goals = []
+    for q in states:
+        at = robot.link_pose(q, "left_link4")[:3, 3]
+        poses = [target(hand_pose(robot, q)), PoseTarget(frame="left_link4", position=tuple(at))]
+        goals.append(PoseGoal(robot, poses, (), robot.home))
+    found = AnyGoal(robot, goals, np.empty((0, 16)), robot.home)._first(
+        CollisionChecker(robot), np.random.default_rng(0)
+    )
+    assert {*found.members.tolist()} == {0, 1, 2, 3}
+    for q, k in zip(found.states, found.members, strict=True):
+        for link in ("left_hand_palm", "left_link4"):
+            wanted, reached = (robot.link_pose(one, link)[:3, 3] for one in (states[k], q))
+            assert np.abs(wanted - reached).max() < 1e-3
 
 
 def test_poses_and_joint_configurations_are_mixed(robot: Robot, tmp_path: Path) -> None:
