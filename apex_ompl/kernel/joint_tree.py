@@ -54,6 +54,20 @@ class Member(NamedTuple):
     outer: Array
 
 
+class PlacedBody(NamedTuple):
+    """Spheres of a body in the frame of its joint.
+
+    Attributes:
+        centers: Shape (n, 3) [m].
+        outer: Radii of :func:`leaf_radii`, shape (n,) [m].
+        inner: Centers and radii of balls inside of the solid, shape (k, 4) [m].
+    """
+
+    centers: Array
+    outer: Array
+    inner: Array
+
+
 def _motions(joint: JointSpec, q: Array) -> Array:
     """Return the motion of a joint at values of its planned joint, shape (N, 4, 4)."""
     poses = np.tile(np.eye(4), (len(q), 1, 1))
@@ -137,9 +151,24 @@ class JointTree:
         self._known: dict[tuple[object, ...], object] = {}
 
     def inner(self, top: int) -> list[int]:
-        """Return the joints below ``top`` whose bodies are in its cluster, parents first."""
+        """Return the joints below ``top`` whose bodies are in its cluster, branch by branch, parents first."""
+        return self._kept(("inner", top), lambda: self._inner(top))
+
+    def _inner(self, top: int) -> list[int]:
         joints = range(1, len(self.joints))
-        return [k for k in joints if k != top and self.home[k] == top and top in self.chains[k]]
+        found = [k for k in joints if k != top and self.home[k] == top and top in self.chains[k]]
+        return [k for _, k in sorted((self.branch(k, top), k) for k in found)]
+
+    def placed(self, body: BodySpec) -> PlacedBody:
+        """Return what is in the frame of a body's joint; it is kept."""
+        arrays = body.placement, body.centers, body.radii, body.first, body.count, body.inner
+        return self._kept((body.joint, *(np.asarray(one).tobytes() for one in arrays)), lambda: self._placed(body))
+
+    def _placed(self, body: BodySpec) -> PlacedBody:
+        frame, radii = product(self.turns[body.joint].T, body.placement), np.asarray(body.radii, float)
+        centers = transformed(frame, np.asarray(body.centers, float))
+        inner = np.column_stack([transformed(frame, body.inner[:, :3]), body.inner[:, 3]])
+        return PlacedBody(centers, leaf_radii(centers, radii, body), inner)
 
     def ball(
         self, members: Sequence[Member], top: int, inner: Sequence[int], limits: tuple[float, float] | None
@@ -256,17 +285,6 @@ class JointTree:
         """Return the joint below ``top`` that a joint is or hangs at; ``top`` itself, too, where there are many."""
         chain = self.chains[joint]
         return top if self._below[top] >= MOST_PARTS else chain[max(chain.index(top) - 1, 0)]
-
-    def outer_radii(self, centers: Array, body: BodySpec) -> Array:
-        """Return the radii of :func:`leaf_radii`, shape (n,); they are kept."""
-        radii = np.asarray(body.radii, float)
-        key = (
-            centers.tobytes(),
-            radii.tobytes(),
-            np.asarray(body.first, int).tobytes(),
-            np.asarray(body.count, int).tobytes(),
-        )
-        return self._kept(key, lambda: leaf_radii(centers, radii, body))
 
     def _kept(self, key: tuple[object, ...], make: Callable[[], T]) -> T:
         found = self._known.get(key)

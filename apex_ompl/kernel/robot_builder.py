@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from apex_ompl.kernel.clearance_table import ClearanceTable, table_arrays
 from apex_ompl.kernel.compiled.arrays import BINS, FIXED, LIMIT_SLACK, RobotArrays
-from apex_ompl.kernel.joint_tree import ClusterBall, JointTree, Member, transformed
-from apex_ompl.kernel.products import product
+from apex_ompl.kernel.joint_tree import ClusterBall, JointTree, Member
 from apex_ompl.kernel.tables import BodySpec, RobotTables, pair_runs
 from apex_ompl.types import Array, Flags
 
@@ -73,16 +72,13 @@ class _Builder:
         self.rows_of = [
             [k for k, c in enumerate(self.cluster_of) if c == cluster] for cluster in range(len(self.clusters))
         ]
-        frames = [product(tree.turns[b.joint].T, b.placement) for b in self.bodies]
-        self.centers = [
-            transformed(frame, np.asarray(b.centers, float)) for frame, b in zip(frames, self.bodies, strict=True)
-        ]
-        self.inner = [
-            np.column_stack([transformed(frame, b.inner[:, :3]), b.inner[:, 3]])
-            for frame, b in zip(frames, self.bodies, strict=True)
-        ]
-        self.lazy = [
-            [k for _, k in sorted((tree.branch(k, top), k) for k in tree.inner(top))] for top, _ in self.clusters
+        placed = [tree.placed(body) for body in self.bodies]
+        self.centers = [one.centers for one in placed]
+        self.outer = [one.outer for one in placed]
+        self.inner = [one.inner for one in placed]
+        self.lazy = [tree.inner(top) for top, _ in self.clusters]
+        self.branches = [
+            [tree.branch(k, top) for k in ks] for (top, _), ks in zip(self.clusters, self.lazy, strict=True)
         ]
         self.part_of = [(self.clusters.index(keys[b]), branches[b]) for b in order]  # cluster and branch of each body
         self.parts = list(dict.fromkeys(self.part_of))
@@ -106,7 +102,7 @@ class _Builder:
         inner = {k for ks in self.lazy for k in ks}
         trees = [np.asarray(b.radii, float) for b in bodies]
         starts = np.cumsum([0, *(len(t) for t in trees)])
-        outer = [self.tree.outer_radii(c, b) for c, b in zip(self.centers, bodies, strict=True)]
+        outer = self.outer
         balls = [self._ball(c, outer) for c in range(len(self.clusters))]
         pair_rows = self._pairs(pairs)
         pair_balls = self._pair_balls(pair_rows, balls, outer)
@@ -129,8 +125,8 @@ class _Builder:
             part_bodies=_spans([self.part_of.count(part) for part in self.parts]),
             body_joint=_ints([b.joint for b in bodies]),
             body_root=_ints(starts[:-1]),
-            node_first=_ints([start + k for b, start in zip(bodies, starts, strict=False) for k in b.first]),
-            node_count=_ints([k for b in bodies for k in b.count]),
+            node_first=_joined([np.asarray(b.first, np.int64) + k for b, k in zip(bodies, starts, strict=False)]),
+            node_count=_joined([np.asarray(b.count, np.int64) for b in bodies]),
             pair_clusters=_ints([key for key, _, _ in pair_rows]).reshape(-1, 2),
             pair_common=_ints([common for _, common, _ in pair_rows]),
             pair_bodies=_spans([len(rows) for _, _, rows in pair_rows]),
@@ -215,8 +211,7 @@ class _Builder:
 
     def _part_joints(self, cluster: int, branch: int) -> tuple[int, int]:
         """Return the first of a part's joints among the lazy ones, and their number."""
-        before = sum(len(ks) for ks in self.lazy[:cluster])
-        of = [self.tree.branch(k, self.clusters[cluster][0]) for k in self.lazy[cluster]]
+        before, of = sum(len(ks) for ks in self.lazy[:cluster]), self.branches[cluster]
         return (before + of.index(branch), of.count(branch)) if branch in of else (before, 0)
 
     def _part_balls(self, cluster: int, branch: int, outer: Sequence[Array]) -> tuple[Array, Array]:
@@ -224,7 +219,7 @@ class _Builder:
         some = frozenset(k for k, part in enumerate(self.part_of) if part == (cluster, branch))
         dof = self._dof(cluster)
         limits = None if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
-        joints = [k for k in self.lazy[cluster] if self.tree.branch(k, self.clusters[cluster][0]) == branch]
+        joints = [k for k, of in zip(self.lazy[cluster], self.branches[cluster], strict=True) if of == branch]
         return self.tree.part_balls(self._members(cluster, outer, some), self.clusters[cluster][0], joints, limits)
 
     def _members(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None) -> list[Member]:
@@ -244,6 +239,10 @@ class _Builder:
 
 def _ints(values: object) -> NDArray[np.int64]:
     return np.array(values, np.int64)
+
+
+def _joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    return np.concatenate([np.empty(0, np.int64), *parts])
 
 
 def _spans(counts: Sequence[int]) -> NDArray[np.int64]:
