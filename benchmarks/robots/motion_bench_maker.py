@@ -15,6 +15,7 @@ Usage: python -m benchmarks.robots.motion_bench_maker RESOURCES [ROBOT...] [-n 1
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib.metadata import version
@@ -42,6 +43,7 @@ FOLDER = Path(__file__).parents[1] / "runs" / "mbm"
 ROBOTS = ("panda", "ur5", "fetch")
 PACKAGES = {"fetch": "fetch_description"}
 SMALLER = {"fetch": "arm"}  # groups of the SRDF whose joints are part of the group that is planned
+MOST_PAIRS = 3  # that a row names
 Problems = Mapping[str, Problem | None]
 GROUP = r'<group name="{}">.*?</group>'
 
@@ -105,16 +107,18 @@ def run_vamp(mine: figures.Figures, robot: str, names: Iterable[str], found: Cal
         made = vamp_world.environment(problem)
         path = vamp_world.planned(robot, ends, loaded.joint_names, made, times)
         checker = CollisionChecker(loaded, problem.scene, problem.attached, problem.allowed)
-        proved = path is not None and bool(checker.prove(path))
-        length = None if path is None else path_length(path)
-        done[name] = {"found": path is not None, "proved": proved, "length": length, "s": sum(times.values())}
+        proof = None if path is None else checker.prove(path)
+        done[name] = {
+            "found": path is not None, "proved": bool(proof), "pair": list(proof.pair) if proof is not None else [],
+            "length": None if path is None else path_length(path), "s": sum(times.values()),
+        }  # fmt: skip
     mine.write(vamp=done)
 
 
 def vamp_table(rows: Mapping[str, tuple[figures.Figures, list[str]]]) -> str:
     """Return a table of VAMP's runs."""
-    head = ["VAMP", "N", "found by its spheres", "free by the meshes", "ms p50", "p95", "length rad"]
-    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 1)])]
+    head = ["VAMP", "N", "found by its spheres", "free by the meshes", "ms p50", "p95", "length rad", "in the way"]
+    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 2), "---"])]
     for robot, (mine, names) in rows.items():
         runs = [mine.data["vamp"][name] for name in names]
         times = [1e3 * t for t in record.percentiles([run["s"] for run in runs if run["found"]], 50, 95)]
@@ -123,7 +127,9 @@ def vamp_table(rows: Mapping[str, tuple[figures.Figures, list[str]]]) -> str:
         ]
         length = record.percentiles([mine.data["vamp"][name]["length"] for name in both], 50)[0]
         shares = [f"{np.mean([run[key] for run in runs]):.3f}" for key in ("found", "proved")]
-        lines.append(record.row([robot, len(runs), *shares, *(f"{t:.2f}" for t in times), f"{length:.2f}"]))
+        pairs = Counter(" and ".join(run["pair"]) for run in runs if run["found"] and not run["proved"])
+        blamed = ", ".join(f"{pair} {count}" for pair, count in pairs.most_common(MOST_PAIRS))
+        lines.append(record.row([robot, len(runs), *shares, *(f"{t:.2f}" for t in times), f"{length:.2f}", blamed]))
     return "\n".join(lines)
 
 
