@@ -34,10 +34,9 @@ from apex_ompl.robot import load_robot
 from apex_ompl.robot.moveit import convert
 from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.entry_point import run_script
-from apex_ompl.util.files import write_atomically
-from apex_ompl.util.schema import dump_yaml, read_yaml
 from benchmarks.lib import record, vamp_world
 from benchmarks.planners import peers
+from benchmarks.robots.fleet import open_baxter
 
 vamp = vamp_world.library()
 DEPENDS = (
@@ -48,9 +47,7 @@ DEPENDS = (
     "apex_ompl/robot/data/baxter.robot.yaml",
 )
 FOLDER = Path(__file__).parents[1] / "runs" / "motion_bench_maker"
-DATA = record.ROOT / "apex_ompl" / "robot" / "data"
 SETS = ("easy", "medium", "hard")
-OPEN = 0.05  # place of the fingers in the problems [m]
 RANGE, ITERATIONS = 0.5, 1_000_000  # of VAMP's RRT-Connect for Baxter, by its own package
 RUNNER = "benchmarks.planners.motion_bench_maker:plan_with_vamp"
 ROWS = (
@@ -113,12 +110,7 @@ def plan_with_vamp(job: Job) -> Run:
 def converted(folder: Path, count: int) -> list[Path]:
     """Return problem files of the first requests of each set, which are made where they are missing."""
     FOLDER.mkdir(parents=True, exist_ok=True)
-    data, place = read_yaml(DATA / "baxter.robot.yaml", "file of a robot"), FOLDER / "baxter_open.robot.yaml"
-    for side in "lr":
-        for finger, sign in (("l", 1.0), ("r", -1.0)):
-            data["locked"][f"{side}_gripper_{finger}_finger_joint"] = sign * OPEN
-    data["covers"] = str(DATA / data["covers"])
-    write_atomically(place, dump_yaml(data).encode())
+    place = open_baxter(FOLDER / "baxter_open.robot.yaml")
     robot, files = load_robot(place), list[Path]()
     for kind in SETS:
         there = sorted(folder.rglob(f"bookshelf_tall_both_arms_{kind}_baxter/request*.yaml"))[:count]

@@ -7,10 +7,14 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import apex_ompl
 from apex_ompl.robot.new import new_robot, sources_of
 from apex_ompl.util.files import write_atomically
+from apex_ompl.util.schema import dump_yaml, read_yaml
 
 PACKAGE = "package://example-robot-data/robots"
+BAXTER = Path(apex_ompl.__file__).parent / "robot" / "data" / "baxter.robot.yaml"
+OPEN = 0.05  # place of a finger of an open gripper [m]
 PLANAR = "planar.urdf"
 SIZES = (0.4, 0.3, 0.25, 0.2)  # lengths of the planar arm's links [m]
 
@@ -93,3 +97,14 @@ def robot_file(name: str, folder: Path) -> Path:
         text = made.read_text().replace(f"  # {cell.torso}: {{", f"  {cell.torso}: {{")
         write_atomically(made, re.sub(rf"(?m)^  {cell.torso}: [^{{\n]*\n", "", text).encode())
     return made
+
+
+def open_baxter(file: Path) -> Path:
+    """Write the robot file of the Baxter that ships with its grippers open, as MotionBenchMaker has it; return it."""
+    data = read_yaml(BAXTER, "robot file")
+    for side in "lr":
+        for finger, sign in (("l", 1.0), ("r", -1.0)):
+            data["locked"][f"{side}_gripper_{finger}_finger_joint"] = sign * OPEN
+    data["covers"] = str(BAXTER.with_name(data["covers"]))
+    write_atomically(file, dump_yaml(data).encode())
+    return file

@@ -1,13 +1,13 @@
-"""MotionBenchMaker's problems of the Panda, the UR5 and the Fetch: apex without a model beside rrtconnect+polish.
+"""MotionBenchMaker's problems of the Panda, UR5, Fetch and Baxter: apex without a model beside rrtconnect+polish.
 
 The problems (Chamzas et al. 2022), URDFs, SRDFs and meshes are those of VAMP's repository, github.com/KavrakiLab/vamp,
 whose folder ``resources`` is given, its ``problems.tar.bz2`` unpacked. Robots are set up by ``apex-ompl robot new``
 from them, the Fetch with its torso, locked joints as at the start of the first problem, and prepared by
-``apex-ompl robot prepare``. Meshes decide. Problems whose start or goal the meshes refuse are left out and counted.
-Those of Baxter are in benchmarks/planners/motion_bench_maker.py. With --vamp VAMP plans them, too, whose robots are
+``apex-ompl robot prepare``; Baxter is the one that ships, with both arms and open grippers. Meshes decide. Problems
+whose start or goal the meshes refuse are left out and counted. With --vamp VAMP plans them, too, whose robots are
 spheres of its own, and has as many iterations as it wants; its shortened paths are then proved by the meshes here, and
-not repaired. Times and columns are those of
-:mod:`benchmarks.robots.any_robot`; figures are kept in benchmarks/runs/mbm.
+not repaired. Times and columns are those of :mod:`benchmarks.robots.any_robot`; figures are kept in
+benchmarks/runs/mbm.
 
 Usage: python -m benchmarks.robots.motion_bench_maker RESOURCES [ROBOT...] [-n 100] [--vamp] [--folder FOLDER]
 """
@@ -37,10 +37,11 @@ from apex_ompl.util.schema import dump_yaml, read_yaml
 from apex_ompl.util.validation import check_name
 from benchmarks.lib import record, vamp_world
 from benchmarks.robots import figures
+from benchmarks.robots.fleet import open_baxter
 
 DEPENDS = ("@planning", "benchmarks/robots/figures.py", "benchmarks/lib/vamp_world.py")
 FOLDER = Path(__file__).parents[1] / "runs" / "mbm"
-ROBOTS = ("panda", "ur5", "fetch")
+ROBOTS = ("panda", "ur5", "fetch", "baxter")
 PACKAGES = {"fetch": "fetch_description"}
 SMALLER = {"fetch": "arm"}  # groups of the SRDF whose joints are part of the group that is planned
 MOST_PAIRS = 3  # that a row names
@@ -67,6 +68,8 @@ def set_up(robot: str, resources: Path, folder: Path) -> Path:
     if file.exists():
         return file
     file.parent.mkdir(parents=True, exist_ok=True)
+    if robot == "baxter":
+        return open_baxter(file)
     text, srdf = read_text(here / f"{robot}.srdf", "SRDF"), file.parent / f"{robot}.srdf"
     if robot in SMALLER:
         text = re.sub(GROUP.format(SMALLER[robot]), "", text, count=1, flags=re.DOTALL)
