@@ -26,6 +26,7 @@ from apex_ompl.errors import ApexError
 from apex_ompl.util.process import end_quickly
 
 PROBLEM_HELP = "name of a problem, an id as shelf/hard/900012, or a YAML file"
+AT_ONCE_HELP = "start each arm's steps as soon as what they need is done"
 RESULT_HELP = "a saved plan or run (.npz, .json, .yaml)"
 GARBAGE = 200_000  # objects between collections of the youngest
 
@@ -162,9 +163,7 @@ def _add_plan(commands: Commands[argparse.ArgumentParser], name: str, text: str)
     )  # fmt: skip
     parser.add_argument("--no-timing", action="store_true", help="leave the path without times")
     if name == "sequence":
-        parser.add_argument(
-            "--asynchronous", action="store_true", help="start each arm's steps as soon as what they need is done"
-        )
+        parser.add_argument("--asynchronous", action="store_true", help=AT_ONCE_HELP)
     parser.add_argument(
         "--timing-method", default="ruckig", metavar="NAME",
         help="of time parameterization: ruckig or spline (default: %(default)s)",
@@ -241,8 +240,9 @@ def _add_run(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--driver", metavar="NAME", help="the robot that is driven: mujoco, in physics, or kinematic, an exact one. "
         "With mujoco a problem whose obstacles stand still is executed to the end of its task, to which of these "
-        "options --seed, --timeout, --out, --film and --json apply",
+        "options --seed, --timeout, --asynchronous, --out, --film and --json apply",
     )  # fmt: skip
+    parser.add_argument("--asynchronous", action="store_true", help=AT_ONCE_HELP)
     parser.add_argument(
         "--camera", action="store_true", help="objects in the hands and obstacles are seen by simulated cameras and "
         "not told; in physics, unless obstacles move",

@@ -33,6 +33,10 @@ def run(parsed: argparse.Namespace) -> int:
     if parsed.film is not None:
         expected = "a problem whose obstacles stand still, with --driver mujoco; films of runs: apex-ompl render"
         raise ParameterError("--film", str(parsed.film), expected)
+    if parsed.asynchronous:
+        raise ParameterError(
+            "--asynchronous", True, "it with a problem whose obstacles stand still and --driver mujoco"
+        )
     if parsed.out is not None:
         suffix_of(parsed.out, SUFFIXES)
         check_writable(parsed.out)
@@ -67,6 +71,7 @@ def _execute(problem: Problem, parsed: argparse.Namespace) -> int:
     from apex_ompl.physics.execution import FILM_RATE
     from apex_ompl.physics.result import SUFFIXES, UNPLANNED
     from apex_ompl.physics.runner import TaskRunner
+    from apex_ompl.planning import TaskSearch
 
     for file, known in ((parsed.out, SUFFIXES), (parsed.film, FILMS)):
         if file is not None:
@@ -79,9 +84,12 @@ def _execute(problem: Problem, parsed: argparse.Namespace) -> int:
         from apex_ompl.physics.camera import CameraRunner
 
         cameras = load_cameras(parsed.cameras) if parsed.cameras else default_cameras()
+        if parsed.asynchronous:
+            raise ParameterError("--asynchronous", True, "it without --camera")
         runner: TaskRunner | CameraRunner = CameraRunner(problem, cameras, parsed.cubes, timeout=parsed.timeout)
     else:
-        runner = TaskRunner(problem, timeout=parsed.timeout)
+        search = TaskSearch(asynchronous=parsed.asynchronous)
+        runner = TaskRunner(problem, timeout=parsed.timeout, search=search)
     result, frames = runner.run(parsed.seed, FILM_SIZE if parsed.film is not None else None)
     if parsed.out is not None:
         result.save(parsed.out)

@@ -61,7 +61,10 @@ CALLS: tuple[tuple[tuple[int, ...], str], ...] = (  # exit codes that may be, an
     ),
     ((0, 1), "run own.yaml --clock real --timeout 3 --out real.json"),
     ((0, 1), "run own.yaml --driver kinematic --timeout 3"),
-    ((0, 1, 2), "run own.yaml --driver mujoco --seed 1 --timeout 20 --out task.npz --json"),  # 2 without MuJoCo
+    (
+        (0, 1, 2),
+        "run own.yaml --driver mujoco --asynchronous --seed 1 --timeout 20 --out task.npz --json",
+    ),  # 2 without MuJoCo
     ((2,), "run own.yaml --driver mujoco --film task.gif"),
     ((0, 1), "run interceptor/vertical/small/800000 --method no-network --camera --cameras eye.yaml --timeout 2"),
     ((0, 1, 2, 3), "run own.yaml --camera --cubes 1 --timeout 20"),  # 2 without MuJoCo or OpenGL

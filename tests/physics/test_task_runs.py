@@ -186,6 +186,8 @@ def test_seeds_are_not_negative() -> None:
         (["stack_boxes", "--driver", "mujoco", "--seed", "-1"], "seed"),
         (["stack_boxes", "--driver", "mujoco", "--timeout", "nan"], "timeout"),
         (["stackboxes", "--driver", "mujoco"], "stackboxes"),
+        (["stack_boxes", "--asynchronous"], "--driver mujoco"),
+        (["stack_boxes", "--camera", "--asynchronous"], "without --camera"),
         (["vertical/moving-large-0.1/900001", "--driver", "mujoco", "--film", "f.mp4"], "stand still"),
     ],
 )
