@@ -129,11 +129,11 @@ class ApexParameters(Parameters):
         found: list[Stage] = [stages.KnownCandidates(self.line)]
         for number, count in enumerate(self.batches or (0,)):
             if self.sprints:
-                found.append(stages.Sprint(self.sprint * SPRINT_FACTORS[number], self.range))
+                found.append(stages.Sprint(self.sprint * SPRINT_FACTORS[number], self.range, exact=number > 0))
             if number == 0:
                 found.append(stages.CheckKnown())
             again = number == 0 and self.sprints
-            between = [stages.Sprint(self.sprint * AGAIN, self.range)] if again else []
+            between = [stages.Sprint(self.sprint * AGAIN, self.range, exact=True)] if again else []
             found += proposal_round(count, between=between)
             if self.bridge and self.lambda_obs == 0.0 and number < len(self.batches) - 1:
                 found.append(stages.Bridging(self.range, QUICK_CALLS))

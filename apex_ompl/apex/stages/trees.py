@@ -21,6 +21,7 @@ from ompl import base as ob
 from ompl import geometric as og
 
 from apex_ompl.apex.context import SolveContext, joins
+from apex_ompl.apex.models import PerturbationModel
 from apex_ompl.apex.path_validator import PathValidator
 from apex_ompl.apex.stages.proposals import Farthest
 from apex_ompl.apex.stages.stage import Solution, Stage, run_stage
@@ -31,6 +32,7 @@ from apex_ompl.types import Array
 
 OMPL_RANGE = 0.2  # OMPL's choice of the longest step, as a share of the extent of the space
 OMPL_SHARE = 0.125  # of the iterations of compiled trees that OMPL's have, which take several times as long for one
+EXACT_SHARE = 1 / 32  # the same, in a sprint
 OmplTrees = tuple[og.RRTConnect, ob.ProblemDefinition]
 
 
@@ -213,17 +215,24 @@ class Sprint:
     Attributes:
         iterations: Number of iterations of compiled trees; OMPL's have OMPL_SHARE of it where another checker decides.
         tree_range: Longest step of the trees; 0 lets OMPL choose [rad].
+        exact: Whether OMPL's trees, with the exact check, go on after compiled ones where there is no trained model.
     """
 
     iterations: int
     tree_range: float
+    exact: bool = False
 
     def run(self, context: SolveContext) -> Solution | None:
         """Return the path of the trees, or None."""
         if context.stop():
             return None
         with context.report.timed("sprint"):
-            states = self._compiled(context) if context.validator.by_spheres else self._of_ompl(context)
+            if not context.validator.by_spheres:
+                states = self._of_ompl(context, self.iterations)
+            else:
+                states = self._compiled(context)
+                if states is None and self.exact and isinstance(context.sampler.model, PerturbationModel):
+                    states = self._of_ompl(context, math.ceil(EXACT_SHARE * self.iterations))
         return None if states is None else verified(context, states, "sprint", self)
 
     def _compiled(self, context: SolveContext) -> Array | None:
@@ -235,11 +244,11 @@ class Sprint:
             context.sprint_trees = None
         return states
 
-    def _of_ompl(self, context: SolveContext) -> Array | None:
+    def _of_ompl(self, context: SolveContext, iterations: int) -> Array | None:
         """Return the path of OMPL's trees, with OMPL's longest step first: other checkers' scenes may be wide open."""
         start, goal = context.pairs[0]
         exclusive = context.validator.exclusive
-        calls = self.iterations if exclusive else math.ceil(OMPL_SHARE * self.iterations)
+        calls = iterations if exclusive else math.ceil(OMPL_SHARE * iterations)
         for tree_range in (self.tree_range,) if exclusive else dict.fromkeys((0.0, self.tree_range)):
             trees = context.sprint_ompl_trees.get(tree_range)
             trees = trees or rooted_ompl_trees(context, [start], goal, tree_range)
