@@ -15,7 +15,7 @@ from planning import DIFFUSION_ONLY, EXACT, HARD, TIMEOUT, cached_problem, state
 from apex_ompl import plan, planners
 from apex_ompl.apex.parameters import ApexParameters
 from apex_ompl.apex.path_validator import PathValidator
-from apex_ompl.apex.stages import Propose, Solution, TakeTurns, shorten
+from apex_ompl.apex.stages import Propose, Solution, Sprint, TakeTurns, shorten
 from apex_ompl.apex.stages.trees import ITERATIONS
 from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.ompl.validity import full_check
@@ -59,6 +59,19 @@ def test_open_scenes_take_a_sprint_of_a_tree() -> None:
     for params in ({"sprint": 0}, {"fallback": False}, {"lambda_obs": 0.001}):
         other = plan(problem, timeout=10.0, params=params)
         assert other and other.solved_by != "sprint" and INSIDE + "sprint" not in other.times
+
+
+@pytest.mark.parametrize(("model", "by"), [("none", "sprint"), (None, "")])
+def test_where_no_model_is_trained_ompls_trees_sprint_where_spheres_prove_no_way(
+    model: str | None, by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Sprint, "_compiled", lambda *_: None)  # the spheres prove no way
+    monkeypatch.setattr(Propose, "run", lambda *_: None)
+    monkeypatch.setattr(TakeTurns, "run", lambda *_: None)
+    params = {"line": False, "bridge": False} | ({} if model is None else {"model": model})
+    result = plan("reach_past_post", timeout=20.0, seed=1, params=params)
+    assert result.solved_by == by, result.reason
+    assert bool(result) == bool(by)
 
 
 def test_a_sprint_that_is_not_enough_is_the_beginning_of_the_fallback() -> None:
