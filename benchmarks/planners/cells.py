@@ -95,7 +95,7 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
             fresh = [r["cpu_s"] for r in runs if (r["kind"], r["row"]) == (kind, FIRST)] if row == COMPARED[0] else []
             first = record.percentiles(fresh, 50)[0] if fresh else float("nan")
             solved = f"{sum(r['solved'] for r in mine)}/{len(mine)}"
-            times = [f"{x:.2f}" for x in (*spent, first, *makespans)]
+            times = ["-" if np.isnan(x) else f"{x:.2f}" for x in (*spent, first, *makespans)]
             lines.append([kind, row, solved, *times, f"{examined:.0f}"])
             counts = Counter[str]()
             for run in mine:
