@@ -44,28 +44,34 @@ def environment(problem: Problem) -> Any:
 
 
 def planned(
-    robot: str, ends: Sequence[Array], joint_names: Sequence[str], made: Any, times: dict[str, float]
-) -> Array | None:
-    """Return the shortened path of VAMP's RRT-Connect, with its own settings, shape (K, dof); None where it finds none.
+    robot: str, ends: Sequence[Array], joint_names: Sequence[str], made: Any, times: dict[str, float], *,
+    seed: int = 0, **changes: Any,
+) -> list[Array]:  # fmt: skip
+    """Return the shortened path of VAMP's RRT-Connect and the one that it found, shape (K, dof); none where none is.
 
     Args:
-        robot: Name of one of its robots.
+        robot: Name of one of its robots, whose range is VAMP's.
         ends: Start and goal, shape (dof,) each.
         joint_names: Their joints.
         made: The environment.
         times: Gets the times of search and shortening [s].
+        seed: Number of samples that are left out first.
+        changes: Changes of its ``RRTCSettings``.
     """
-    vamp = library()
-    module, planner, settings, simplified = vamp.configure_robot_and_planner_with_kwargs(robot, "rrtc")
-    settings.max_iterations = settings.max_samples = ITERATIONS
+    module, planner, settings, simplified = library().configure_robot_and_planner_with_kwargs(robot, "rrtc")
+    for name, value in ({"max_iterations": ITERATIONS, "max_samples": ITERATIONS} | changes).items():
+        setattr(settings, name, value)
     rng, names = module.halton(), [str(name) for name in module.joint_names()]
+    for _ in range(seed):
+        rng.next()
     there, back = [joint_names.index(name) for name in names], [names.index(name) for name in joint_names]
     with timed(times, "solve"):
         found = planner(*(q[there].astype(np.float32) for q in ends), made, settings, rng)
     if not found.solved:
-        return None
+        return []
     with timed(times, "simplify"):
         shortened = module.simplify(found.path, made, simplified, rng)
-    states = np.array(shortened.path.numpy(), float)[:, back]
-    states[0], states[-1] = ends
-    return states
+    paths = [np.array(path.path.numpy(), float)[:, back] for path in (shortened, found)]
+    for states in paths:
+        states[0], states[-1] = ends
+    return paths

@@ -32,9 +32,10 @@ from apex_ompl.ompl.tuned import TUNED
 from apex_ompl.paths.path import path_length
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.moveit import convert
-from apex_ompl.util.clocks import Deadline, timed
+from apex_ompl.util.clocks import Deadline
 from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record, vamp_world
+from benchmarks.lib.full_check import proved_or_repaired
 from benchmarks.planners import peers
 from benchmarks.robots.fleet import open_baxter
 
@@ -48,7 +49,6 @@ DEPENDS = (
 )
 FOLDER = Path(__file__).parents[1] / "runs" / "motion_bench_maker"
 SETS = ("easy", "medium", "hard")
-RANGE, ITERATIONS = 0.5, 1_000_000  # of VAMP's RRT-Connect for Baxter, by its own package
 RUNNER = "benchmarks.planners.motion_bench_maker:plan_with_vamp"
 ROWS = (
     Row("apex", "apex"),
@@ -81,24 +81,13 @@ def plan_with_vamp(job: Job) -> Run:
     problem = load_problem(job.problem)
     ready, made = assemble(problem), vamp_world.environment(problem)
     same = agreement(ready, made, np.random.default_rng(job.seed))
-    settings, rng = vamp.RRTCSettings(), vamp.baxter.halton()
-    settings.range, settings.max_iterations, settings.max_samples = RANGE, ITERATIONS, ITERATIONS
-    for name, value in job.params.items():
-        setattr(settings, name, value)
-    for _ in range(job.seed):
-        rng.next()
-    start, goal = (q.astype(np.float32) for q in (ready.start, ready.goals[0]))
     deadline, times = Deadline(job.timeout), dict[str, float]()
-    with timed(times, "solve"):
-        found = vamp.baxter.rrtc(start, goal, made, settings, rng)
-    if not found.solved:
+    candidates = vamp_world.planned(
+        "baxter", (ready.start, ready.goals[0]), ready.robot.joint_names, made, times, seed=job.seed, **job.params
+    )
+    if not candidates:
         return {"solved": False, "reason": "VAMP found no path", "times": times, "own": False, "agreement": same}
-    with timed(times, "simplify"):
-        shortened = vamp.baxter.simplify(found.path, made, vamp.SimplifySettings(), rng)
-    candidates = [path.path.numpy().astype(float) for path in (shortened, found)]
-    for states in candidates:
-        states[0], states[-1] = ready.start, ready.goals[0]
-    path, reason = peers.prove(ready, candidates, deadline.at, times)
+    path, reason = proved_or_repaired(ready, candidates, deadline.at, times)
     first = times["solve"] + first_path_proof(ready.checker, candidates[-1], ready.start, ready.goals, times)
     return {
         "solved": path is not None, "first": first if path is not None else None, "total": sum(times.values()),

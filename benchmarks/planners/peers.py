@@ -28,12 +28,9 @@ from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import NO_PROBLEM, Run, first_path_proof
 from apex_ompl.evaluation.summary import Statistics
-from apex_ompl.ompl.repair import repair
 from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.ompl.tuned import TUNED
-from apex_ompl.ompl.validity import full_check
 from apex_ompl.paths.path import SEARCH_RESOLUTION, path_length
-from apex_ompl.planning.steps import NOT_PROVED
 from apex_ompl.robot import Robot
 from apex_ompl.robot.model import link_of
 from apex_ompl.scene.bodies import Body, pose_matrix
@@ -42,6 +39,7 @@ from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline, timed
 from apex_ompl.util.entry_point import run_script
 from benchmarks.lib import record
+from benchmarks.lib.full_check import proved_or_repaired
 
 try:
     from roboplan.core import (
@@ -180,33 +178,13 @@ def plan_with_roboplan(job: Job) -> Run:
     candidates = [np.array(path.positions)[:, order] for path in (shortened, found)]
     for states in candidates:
         states[0], states[-1] = ready.start, ready.goals[0]
-    path, reason = prove(ready, candidates, deadline.at, times)
+    path, reason = proved_or_repaired(ready, candidates, deadline.at, times)
     total = sum(times.values())
     first = times["solve"] + first_path_proof(ready.checker, candidates[-1], ready.start, ready.goals, times)
     return {
         "solved": path is not None, "first": first if path is not None else None, "total": total, "times": times,
         "length": None if path is None else path_length(path), "reason": reason, "agreement": same,
     }  # fmt: skip
-
-
-def prove(
-    ready: PlanningSetup, candidates: Sequence[Array], deadline: float, times: dict[str, float]
-) -> tuple[Array | None, str]:
-    """Return the first candidate that passes the full check, or is repaired, and the reason where there is none."""
-    reason = ""
-    for states in candidates:
-        with timed(times, "verify"):
-            check = full_check(ready.checker, states, ready.start, ready.goals, deadline=deadline)
-        if check:
-            return states, ""
-        if check.timed_out:
-            return None, NOT_PROVED
-        reason = reason or f"the path found failed the full check and repair, {check.reason}"
-        with timed(times, "repair"):
-            repaired = repair(ready, states, check, deadline)
-        if repaired is not None:
-            return repaired[0].states, ""
-    return None, reason
 
 
 def summary(runs: Sequence[Run]) -> dict[str, Any]:

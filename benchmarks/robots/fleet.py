@@ -105,6 +105,7 @@ def open_baxter(file: Path) -> Path:
     for side in "lr":
         for finger, sign in (("l", 1.0), ("r", -1.0)):
             data["locked"][f"{side}_gripper_{finger}_finger_joint"] = sign * OPEN
-    data["covers"] = str(BAXTER.with_name(data["covers"]))
+    covers = BAXTER.with_name(data["covers"])
+    write_atomically(file.with_name(covers.name), covers.read_bytes())  # tables are written beside them
     write_atomically(file, dump_yaml(data).encode())
     return file

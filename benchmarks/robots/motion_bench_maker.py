@@ -5,9 +5,9 @@ whose folder ``resources`` is given, its ``problems.tar.bz2`` unpacked. Robots a
 from them, the Fetch with its torso, locked joints as at the start of the first problem, and prepared by
 ``apex-ompl robot prepare``; Baxter is the one that ships, with both arms and open grippers. Meshes decide. Problems
 whose start or goal the meshes refuse are left out and counted. With --vamp VAMP plans them, too, whose robots are
-spheres of its own, and has as many iterations as it wants; its shortened paths are then proved by the meshes here, and
-not repaired. Times and columns are those of :mod:`benchmarks.robots.any_robot`; figures are kept in
-benchmarks/runs/mbm.
+spheres of its own, with its own settings and without dynamic domains, and has a million iterations. Its shortened path
+is then proved by the meshes here, or repaired; where that fails, the path as it was found is tried. Times and columns
+are those of :mod:`benchmarks.robots.any_robot`; figures are kept in benchmarks/runs/mbm.
 
 Usage: python -m benchmarks.robots.motion_bench_maker RESOURCES [ROBOT...] [-n 100] [--vamp] [--folder FOLDER]
 """
@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -26,24 +27,34 @@ import numpy as np
 
 from apex_ompl.collision import CollisionChecker
 from apex_ompl.errors import MissingFileError
+from apex_ompl.ompl.setup import assemble
 from apex_ompl.paths.path import path_length
 from apex_ompl.robot import load_robot
 from apex_ompl.robot.moveit import convert
 from apex_ompl.robot.new import new_robot, sources_of
 from apex_ompl.scene.problem import Problem
+from apex_ompl.util.clocks import Deadline
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import read_text, write_atomically
 from apex_ompl.util.schema import dump_yaml, read_yaml
 from apex_ompl.util.validation import check_name
 from benchmarks.lib import record, vamp_world
+from benchmarks.lib.full_check import proved_or_repaired
 from benchmarks.robots import figures
 from benchmarks.robots.fleet import open_baxter
 
-DEPENDS = ("@planning", "benchmarks/robots/figures.py", "benchmarks/lib/vamp_world.py")
+DEPENDS = (
+    "@planning",
+    "benchmarks/robots/figures.py",
+    "benchmarks/robots/fleet.py",
+    "benchmarks/lib/vamp_world.py",
+    "benchmarks/lib/full_check.py",
+)
 FOLDER = Path(__file__).parents[1] / "runs" / "mbm"
 ROBOTS = ("panda", "ur5", "fetch", "baxter")
 PACKAGES = {"fetch": "fetch_description"}
 SMALLER = {"fetch": "arm"}  # groups of the SRDF whose joints are part of the group that is planned
+VAMP: Mapping[str, Mapping[str, Any]] = {"VAMP": {}, "VAMP without dynamic domains": {"dynamic_domain": False}}
 MOST_PAIRS = 3  # that a row names
 Problems = Mapping[str, Problem | None]
 GROUP = r'<group name="{}">.*?</group>'
@@ -99,41 +110,52 @@ def problems(robot: Path, resources: Path, most: int) -> Iterator[tuple[str, Pro
 
 def run_vamp(mine: figures.Figures, robot: str, names: Iterable[str], found: Callable[[], Problems]) -> None:
     """Let VAMP plan for the problems that are missing."""
-    done: dict[str, Any] = mine.data.setdefault("vamp", {})
+    done: dict[str, Any] = mine.data.setdefault("vamp", {label: {} for label in VAMP})
     loaded = load_robot(mine.robot)
-    for name in names:
-        if name in done:
+    for name, (label, changes) in product(names, VAMP.items()):
+        if name in done[label]:
             continue
         problem, times = found()[name], dict[str, float]()
         assert problem is not None
-        ends = problem.start_state(loaded.joint_names), problem.goal_states(loaded.joint_names)[0]
-        made = vamp_world.environment(problem)
-        path = vamp_world.planned(robot, ends, loaded.joint_names, made, times)
-        checker = CollisionChecker(loaded, problem.scene, problem.attached, problem.allowed)
-        proof = None if path is None else checker.prove(path)
-        done[name] = {
-            "found": path is not None, "proved": bool(proof), "pair": list(proof.pair) if proof is not None else [],
-            "length": None if path is None else path_length(path), "s": sum(times.values()),
+        ready, made = assemble(problem, loaded), vamp_world.environment(problem)
+        ends, deadline = (ready.start, ready.goals[0]), Deadline(figures.TIMEOUT)
+        paths = vamp_world.planned(robot, ends, loaded.joint_names, made, times, **changes)
+        own, proof = sum(times.values()), ready.checker.prove(paths[0]) if paths else None
+        path, _ = proved_or_repaired(ready, paths, deadline.at, times) if paths else (None, "")
+        done[label][name] = {
+            "found": bool(paths), "free": bool(proof), "pair": list(proof.pair) if proof is not None else [],
+            "own_s": own, "solved": path is not None, "s": sum(times.values()),
+            "length": None if path is None else path_length(path),
         }  # fmt: skip
     mine.write(vamp=done)
 
 
 def vamp_table(rows: Mapping[str, tuple[figures.Figures, list[str]]]) -> str:
     """Return a table of VAMP's runs."""
-    head = ["VAMP", "N", "found by its spheres", "free by the meshes", "ms p50", "p95", "length rad", "in the way"]
-    lines = [record.row(head), record.row(["---", *["---:"] * (len(head) - 2), "---"])]
+    head = [
+        "robot", "planner", "N", "found by its spheres", "free by the meshes", "ms p50", "p95", "solved with repair",
+        "ms p50", "p95", "length rad", "in the way at first",
+    ]  # fmt: skip
+    lines = [record.row(head), record.row(["---", "---", *["---:"] * (len(head) - 3), "---"])]
     for robot, (mine, names) in rows.items():
-        runs = [mine.data["vamp"][name] for name in names]
-        times = [1e3 * t for t in record.percentiles([run["s"] for run in runs if run["found"]], 50, 95)]
-        both = [
-            name for name in names if mine.data["vamp"][name]["found"] and mine.data["runs"][name]["apex"]["solved"]
-        ]
-        length = record.percentiles([mine.data["vamp"][name]["length"] for name in both], 50)[0]
-        shares = [f"{np.mean([run[key] for run in runs]):.3f}" for key in ("found", "proved")]
-        pairs = Counter(" and ".join(run["pair"]) for run in runs if run["found"] and not run["proved"])
-        blamed = ", ".join(f"{pair} {count}" for pair, count in pairs.most_common(MOST_PAIRS))
-        lines.append(record.row([robot, len(runs), *shares, *(f"{t:.2f}" for t in times), f"{length:.2f}", blamed]))
+        for label in VAMP:
+            runs = [mine.data["vamp"][label][name] for name in names]
+            shares = [f"{np.mean([run[key] for run in runs]):.3f}" for key in ("found", "free", "solved")]
+            own, whole = (
+                [f"{1e3 * t:.1f}" if t is not None else "-" for t in (_reached(runs, *keys, p) for p in (50, 95))]
+                for keys in (("found", "own_s"), ("solved", "s"))
+            )
+            length = record.percentiles([run["length"] for run in runs if run["solved"]], 50)[0]
+            pairs = Counter(" and ".join(run["pair"]) for run in runs if run["found"] and not run["free"])
+            blamed = ", ".join(f"{pair} {count}" for pair, count in pairs.most_common(MOST_PAIRS))
+            cells = [robot, label, len(runs), *shares[:2], *own, shares[2], *whole, f"{length:.2f}", blamed]
+            lines.append(record.row(cells))
     return "\n".join(lines)
+
+
+def _reached(runs: Sequence[Mapping[str, Any]], done: str, seconds: str, p: float) -> float | None:
+    """Return a percentile of times, those of runs that are not done last; None where it is one of them."""
+    return record.reached([run[seconds] if run[done] else np.inf for run in runs], p)
 
 
 def main() -> None:
@@ -165,7 +187,8 @@ def main() -> None:
     data, table = figures.table(rows)
     if all("vamp" in mine.data for mine, _ in rows.values()):
         data["vamp"] = {
-            robot: {name: mine.data["vamp"][name] for name in names} for robot, (mine, names) in rows.items()
+            robot: {label: {name: mine.data["vamp"][label][name] for name in names} for label in VAMP}
+            for robot, (mine, names) in rows.items()
         }
         table = f"{table}\n\n{vamp_table(rows)}"
         settings["vamp"] = version("vamp-planner")
