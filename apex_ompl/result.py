@@ -93,11 +93,11 @@ class PlanResult:
             ``solve``.
         length: Sum of Euclidean joint-space steps [rad], NaN without a path.
         clearance: Least distance of any checked pair along the whole path, by the exact shapes [m]; infinite without
-            any pair, NaN without a proved path.
+            any pair, NaN without a proved path. Links that are apart as in a bearing, by a table, do not count.
         clearance_bound: What of ``clearance`` is proved: no state of the path is nearer to contact [m]. It is less by
             10 um at most, or by half where ``clearance`` is smaller than that.
         clearance_pair: Names of the two bodies that have it.
-        proved_by_spheres: Share of the path's length that sphere covers proved; exact shapes proved the rest.
+        proved_by_spheres: Share of the path's length that sphere covers, and tables, proved for all pairs at once.
         checks: Number of states checked one by one; those inside proved stretches of motions do not count.
         solved_by: What found the path: the planner's name, or the stage of apex that did (see
             ``apex_ompl.ompl.own_planner.SolveReport``), with ``+repair`` where a stretch of it failed the full check

@@ -98,9 +98,10 @@ class PathProof:
         state: The state there, shape (dof,).
         clearance: Least distance of a checked pair that was found at a state [m], infinite where there is no pair, NaN
             for hands outside their limits. Links that a table proves to be apart as in a bearing do not count.
-        clearance_bound: Least distance that is proved along the whole curve [m]; 0 without a proof.
+        clearance_bound: Least distance that is proved along the whole curve, bearings apart [m]; 0 without a proof.
         pair: Names of the two bodies at the least distance found; empty where there is none.
-        by_spheres: Share of the curve's length that the sphere covers proved alone; exact shapes proved the rest.
+        by_spheres: Share of the curve's length that sphere covers and tables proved for all pairs at once; tables and
+            exact shapes proved the rest pair by pair.
         intervals: Number of intervals checked.
         timed_out: Whether the deadline passed before the proof ended.
     """
