@@ -51,7 +51,14 @@ def main() -> None:
         boxes = cache(lambda file=file: Boxes(load_robot(file), str(file)))
         mine.run(names, lambda name, boxes=boxes: boxes().problem(int(name)))
         rows[robot] = mine, names
-    record.write(args.name, *figures.table(rows), n=args.n, budget=args.budget, **figures.SETTINGS)
+    record.write(
+        args.name,
+        *figures.table(rows),
+        n=args.n,
+        budget=args.budget,
+        run_commits=figures.run_commits(rows),
+        **figures.SETTINGS,
+    )
 
 
 if __name__ == "__main__":

@@ -50,6 +50,10 @@ class Figures:
         self.data |= figures
         write_atomically(self.file, (json.dumps(self.data, indent=1) + "\n").encode())
 
+    def note_commit(self) -> None:
+        """Note the commit of the runs that follow."""
+        self.write(commits=sorted({*self.data.get("commits", ()), record.session()["commit"]}))
+
     def prepare(self, budget: float, jobs: int) -> None:
         """Prepare the robot unless that was done to the end or for the whole budget, and measure the share proved."""
         if not self.data.get("prepared"):
@@ -76,6 +80,7 @@ class Figures:
         missing = [name for name in names if name not in self.data["runs"]]
         if not missing:
             return
+        self.note_commit()
         planner = MotionPlanner(str(self.robot))
         for one, params in PLANNERS.items():  # what a process does once
             planner.plan_problem(problem(missing[0]), one, params=params, timeout=TIMEOUT, timing=False, seed=1)
@@ -110,6 +115,11 @@ class Figures:
             cells += ["-" if value is None else f"{value:.2f}" for value in (soon, *times, length)]
         cells.append(", ".join(f"{pair} {share:.0%}" for pair, share in data["spoilers"].items()))
         return figures, cells
+
+
+def run_commits(rows: Mapping[str, tuple[Figures, list[str]]]) -> str:
+    """Return the commits of all runs."""
+    return "; ".join(sorted({one for mine, _ in rows.values() for one in mine.data.get("commits", ())}))
 
 
 def _percentile(runs: list[dict[str, Any]], p: float) -> float | None:

@@ -112,6 +112,7 @@ def run_vamp(mine: figures.Figures, robot: str, names: Iterable[str], found: Cal
     """Let VAMP plan for the problems that are missing."""
     done: dict[str, Any] = mine.data.setdefault("vamp", {label: {} for label in VAMP})
     loaded = load_robot(mine.robot)
+    mine.note_commit()
     for name, (label, changes) in product(names, VAMP.items()):
         if name in done[label]:
             continue
@@ -183,7 +184,13 @@ def main() -> None:
             run_vamp(mine, robot, names, found)
         rows[robot] = mine, names
     left = ", ".join(f"{robot} {count}" for robot, count in refused.items())
-    settings = {"n": args.n, "budget": args.budget, "refused": left, **figures.SETTINGS}
+    settings = {
+        "n": args.n,
+        "budget": args.budget,
+        "refused": left,
+        "run_commits": figures.run_commits(rows),
+        **figures.SETTINGS,
+    }
     data, table = figures.table(rows)
     if all("vamp" in mine.data for mine, _ in rows.values()):
         data["vamp"] = {
