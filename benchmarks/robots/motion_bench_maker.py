@@ -193,10 +193,6 @@ def main() -> None:
     }
     data, table = figures.table(rows)
     if all("vamp" in mine.data for mine, _ in rows.values()):
-        data["vamp"] = {
-            robot: {label: {name: mine.data["vamp"][label][name] for name in names} for label in VAMP}
-            for robot, (mine, names) in rows.items()
-        }
         table = f"{table}\n\n{vamp_table(rows)}"
         settings["vamp"] = version("vamp-planner")
     record.write("motion_bench_maker_robots", data, table, **settings)
