@@ -34,6 +34,7 @@ LEAST_DESCENTS, MOST_DESCENTS = 4, 32  # for each
 OF_ARM = 4  # states of an arm at a pose that are combined with those of others
 EXAMINED = 4  # goals that are sampled in full: those with the nearest free states
 UNTRIED = 12  # the same where the first search found no free state
+NEAREST = 3  # goals that are the nearest to a state
 SHARE = 2  # states that are returned, as a multiple of those for a goal alone
 
 
@@ -145,6 +146,11 @@ class AnyGoal:
             ranked.append((seen[member], k))
             seen[member] += 1
         return first.states[[int(order[k]) for _, k in sorted(ranked)][:count]]
+
+    def nearest_members(self, q: Array) -> list[PoseGoal | AlignmentGoal]:
+        """Return the goals whose errors at a state, shape (dof,), are least relative to their bounds, at most three."""
+        errors = {k: relative_error(errors, bounds) for k, errors, bounds in self._errors(q)}
+        return [self.members[k] for k in sorted(errors, key=errors.__getitem__)[:NEAREST]]
 
     def member_of(self, q: Array) -> int:
         """Return the number of the first goal that a state, shape (dof,), reaches, or -1 of a joint configuration."""

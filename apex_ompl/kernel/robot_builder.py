@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,19 @@ from apex_ompl.kernel.joint_tree import ClusterBall, JointTree, Member
 from apex_ompl.kernel.tables import BodySpec, RobotTables, pair_runs
 from apex_ompl.types import Array, Flags
 
-PairRow = tuple[tuple[int, int], int, list[tuple[int, int]]]
-"""Two clusters, their lowest common joint, and the pairs of their bodies."""
+
+class PairRow(NamedTuple):
+    """Two clusters whose bodies are checked against each other.
+
+    Attributes:
+        clusters: Their numbers.
+        common: Their lowest common joint.
+        bodies: The rows of the pairs of their bodies, shape (n, 2).
+    """
+
+    clusters: tuple[int, int]
+    common: int
+    bodies: NDArray[np.int64]
 
 
 def robot_tables(
@@ -65,13 +77,15 @@ class _Builder:
         keys = [self._key(b, k) for k, b in enumerate(bodies)]
         self.clusters = sorted(set(keys))
         branches = [tree.branch(b.joint, tree.home[b.joint]) for b in bodies]
-        order = sorted(range(len(bodies)), key=lambda b: (self.clusters.index(keys[b]), branches[b], b))
+        numbers = {key: k for k, key in enumerate(self.clusters)}
+        places = [numbers[key] for key in keys]
+        order = sorted(range(len(bodies)), key=lambda b: (places[b], branches[b], b))
         self.number = {b: k for k, b in enumerate(order)}  # body as given -> row
         self.bodies = [bodies[b] for b in order]
-        self.cluster_of = [self.clusters.index(keys[b]) for b in order]
-        self.rows_of = [
-            [k for k, c in enumerate(self.cluster_of) if c == cluster] for cluster in range(len(self.clusters))
-        ]
+        self.cluster_of = [places[b] for b in order]
+        self.rows_of: list[list[int]] = [[] for _ in self.clusters]
+        for row, cluster in enumerate(self.cluster_of):
+            self.rows_of[cluster].append(row)
         placed = [tree.placed(body) for body in self.bodies]
         self.centers = [one.centers for one in placed]
         self.outer = [one.outer for one in placed]
@@ -80,13 +94,14 @@ class _Builder:
         self.branches = [
             [tree.branch(k, top) for k in ks] for (top, _), ks in zip(self.clusters, self.lazy, strict=True)
         ]
-        self.part_of = [(self.clusters.index(keys[b]), branches[b]) for b in order]  # cluster and branch of each body
+        self.part_of = [(places[b], branches[b]) for b in order]  # cluster and branch of each body
         self.parts = list(dict.fromkeys(self.part_of))
         seen = Counter[int]()
         self.bit_of = dict[tuple[int, int], int]()  # of each part among those of its cluster
         for part in self.parts:
             self.bit_of[part] = 1 << seen[part[0]]
             seen[part[0]] += 1
+        self.driver = [self._dof(cluster) for cluster in range(len(self.clusters))]
 
     def _key(self, body: BodySpec, number: int) -> tuple[int, int]:
         """Return the key of a body's cluster: the joint, and whether it meets the scene; each fixed body is its own."""
@@ -108,7 +123,8 @@ class _Builder:
         pair_balls = self._pair_balls(pair_rows, balls, outer)
         parts = [self._part_balls(*part, outer) for part in self.parts]
         tables = {tuple(sorted(self.number[b] for b in pair)): table for pair, table in clearances.items()}
-        body_rows = [row for _, _, rows in pair_rows for row in rows]
+        body_rows = np.concatenate([np.empty((0, 2), np.int64), *(pair.bodies for pair in pair_rows)])
+        pair_clusters = _ints([pair.clusters for pair in pair_rows]).reshape(-1, 2)
         arrays = RobotArrays(
             joint_parent=_ints([j.parent for j in joints]),
             joint_kind=_ints([j.kind for j in joints]),
@@ -117,20 +133,20 @@ class _Builder:
             lazy=_ints([k for ks in self.lazy for k in ks]),
             cluster_joint=_ints([j for j, _ in self.clusters]),
             cluster_lazy=_spans([len(ks) for ks in self.lazy]),
-            cluster_dof=_ints([self._dof(c) for c in range(len(self.clusters))]),
+            cluster_dof=_ints(self.driver),
             cluster_bodies=_spans([len(rows) for rows in self.rows_of]),
             cluster_meets_scene=_ints([bodies[rows[0]].meets_scene for rows in self.rows_of]),
-            cluster_parts=_spans([sum(c == k for c, _ in self.parts) for k in range(len(self.clusters))]),
+            cluster_parts=_spans(np.bincount([c for c, _ in self.parts], minlength=len(self.clusters)).tolist()),
             part_lazy=_ints([self._part_joints(*part) for part in self.parts]).reshape(-1, 2),
-            part_bodies=_spans([self.part_of.count(part) for part in self.parts]),
+            part_bodies=_spans(list(Counter(self.part_of).values())),
             body_joint=_ints([b.joint for b in bodies]),
             body_root=_ints(starts[:-1]),
             node_first=_joined([np.asarray(b.first, np.int64) + k for b, k in zip(bodies, starts, strict=False)]),
             node_count=_joined([np.asarray(b.count, np.int64) for b in bodies]),
-            pair_clusters=_ints([key for key, _, _ in pair_rows]).reshape(-1, 2),
-            pair_common=_ints([common for _, common, _ in pair_rows]),
-            pair_bodies=_spans([len(rows) for _, _, rows in pair_rows]),
-            bodies=_ints(body_rows).reshape(-1, 2),
+            pair_clusters=pair_clusters,
+            pair_common=_ints([pair.common for pair in pair_rows]),
+            pair_bodies=_spans([len(pair.bodies) for pair in pair_rows]),
+            bodies=body_rows,
             joint_rotation=np.array([p[:3, :3] for p in self.tree.placements]),
             joint_offset=np.array([p[:3, 3] for p in self.tree.placements]),
             joint_ratio=np.array([j.ratio for j in joints], float),
@@ -153,9 +169,9 @@ class _Builder:
             inner_ball=np.concatenate([np.empty((0, 4)), *self.inner]),
             pair_ball=np.array([[[*b.center, b.radius] for b in two] for two in pair_balls]).reshape(-1, 2, 4),
             pair_outer=np.array([[b.outer for b in two] for two in pair_balls]).reshape(-1, 2),
-            pair_parts=_ints([self._pair_parts(rows) for _, _, rows in pair_rows]).reshape(-1, 2),
-            run_pairs=pair_runs(_ints([key for key, _, _ in pair_rows]).reshape(-1, 2)),
-            **table_arrays([tables.get(row) for row in body_rows], joint_names),
+            pair_parts=self._pair_parts(pair_rows),
+            run_pairs=pair_runs(pair_clusters),
+            **table_arrays([tables.get((a, b)) for a, b in body_rows.tolist()], joint_names),
         )
         return RobotTables(name, joint_names, tuple(b.name for b in bodies), tuple(numbers[b] for b in rows), arrays)
 
@@ -166,21 +182,26 @@ class _Builder:
 
     def _range(self, cluster: int) -> tuple[float, float]:
         """Return the lowest value of the joint that drives a cluster's inner ones, and ranges of values per unit."""
-        dof = self._dof(cluster)
+        dof = self.driver[cluster]
         low, high = (0.0, 0.0) if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
         return low, BINS / (high - low) if high > low else 0.0
 
     def _pairs(self, pairs: Sequence[tuple[int, int]]) -> list[PairRow]:
-        """Return pairs of clusters with their lowest common joint and the pairs of bodies."""
-        rows: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        for a, b in pairs:
-            m, n = sorted((self.number[a], self.number[b]))
-            rows.setdefault((self.cluster_of[m], self.cluster_of[n]), []).append((m, n))
+        """Return pairs of clusters, by their numbers."""
+        if not len(pairs):
+            return []
+        row_of = np.empty(len(self.number), np.int64)
+        row_of[list(self.number)] = list(self.number.values())
+        rows = np.sort(row_of[np.array(pairs, np.int64)], axis=1)
+        clusters = np.array(self.cluster_of, np.int64)[rows]
+        order = np.lexsort((rows[:, 1], rows[:, 0], clusters[:, 1], clusters[:, 0]))
+        rows, clusters = rows[order], clusters[order]
+        starts = np.flatnonzero(np.r_[True, (np.diff(clusters, axis=0) != 0).any(axis=1)])
         found = []
-        for (c, d), members in sorted(rows.items()):
+        for (c, d), members in zip(clusters[starts].tolist(), np.split(rows, starts[1:]), strict=True):
             above = set(self.tree.chains[self.clusters[d][0]])
             common = next(k for k in self.tree.chains[self.clusters[c][0]] if k in above)
-            found.append(((c, d), common, sorted(members)))
+            found.append(PairRow((c, d), common, members))
         return found
 
     def _pair_balls(
@@ -188,26 +209,23 @@ class _Builder:
     ) -> list[list[ClusterBall]]:
         """Return for each pair of clusters balls around the bodies that it is about, of rigid clusters their own."""
         known: dict[frozenset[int], ClusterBall] = {}
-        found = []
-        for clusters, _, members in pairs:
-            two = []
-            for cluster, rows in zip(clusters, zip(*members, strict=True), strict=True):
-                some = frozenset(rows)
-                if not self.lazy[cluster] or len(some) == len(self.rows_of[cluster]):
-                    two.append(balls[cluster])
-                    continue
-                if some not in known:
-                    known[some] = self._ball(cluster, outer, some)
-                two.append(known[some])
-            found.append(two)
-        return found
 
-    def _pair_parts(self, members: list[tuple[int, int]]) -> list[int]:
-        """Return the bits of the parts of two clusters that a pair is about."""
-        return [
-            sum({part: self.bit_of[part] for part in (self.part_of[b] for b in rows)}.values())
-            for rows in zip(*members, strict=True)
-        ]
+        def around(cluster: int, rows: NDArray[np.int64]) -> ClusterBall:
+            if not self.lazy[cluster]:
+                return balls[cluster]
+            some = frozenset(rows.tolist())
+            if len(some) == len(self.rows_of[cluster]):
+                return balls[cluster]
+            if some not in known:
+                known[some] = self._ball(cluster, outer, some)
+            return known[some]
+
+        return [[around(cluster, rows) for cluster, rows in zip(p.clusters, p.bodies.T, strict=True)] for p in pairs]
+
+    def _pair_parts(self, pairs: Sequence[PairRow]) -> NDArray[np.int64]:
+        """Return the bits of the parts of two clusters that each pair is about, shape (n, 2)."""
+        bits = _ints([self.bit_of[part] for part in self.part_of])
+        return _ints([np.bitwise_or.reduce(bits[pair.bodies], axis=0) for pair in pairs]).reshape(-1, 2)
 
     def _part_joints(self, cluster: int, branch: int) -> tuple[int, int]:
         """Return the first of a part's joints among the lazy ones, and their number."""
@@ -217,7 +235,7 @@ class _Builder:
     def _part_balls(self, cluster: int, branch: int, outer: Sequence[Array]) -> tuple[Array, Array]:
         """Return the balls around a part."""
         some = frozenset(k for k, part in enumerate(self.part_of) if part == (cluster, branch))
-        dof = self._dof(cluster)
+        dof = self.driver[cluster]
         limits = None if dof < 0 else (float(self.lower[dof]), float(self.upper[dof]))
         joints = [k for k, of in zip(self.lazy[cluster], self.branches[cluster], strict=True) if of == branch]
         return self.tree.part_balls(self._members(cluster, outer, some), self.clusters[cluster][0], joints, limits)
@@ -232,7 +250,7 @@ class _Builder:
 
     def _ball(self, cluster: int, outer: Sequence[Array], some: frozenset[int] | None = None) -> ClusterBall:
         """Return the ball around a cluster, or some bodies of it."""
-        members, dof = self._members(cluster, outer, some), self._dof(cluster)
+        members, dof = self._members(cluster, outer, some), self.driver[cluster]
         limits = None if dof < 0 else (float(self.lower[dof]) - LIMIT_SLACK, float(self.upper[dof]) + LIMIT_SLACK)
         return self.tree.ball(members, self.clusters[cluster][0], self.lazy[cluster], limits)
 

@@ -53,11 +53,11 @@ class TaskGoal:
         """Return the state near another one, shape (dof,), that reaches the goal, or None where there is none."""
         if self.goal is None:
             return next((one for one in self.states if np.abs(one - q).max() <= NEAR), None)
-        for member in self.goal.members if isinstance(self.goal, AnyGoal) else (self.goal,):
-            near = self.start.copy()  # joints that move none of the frames stay
-            near[member.inverse.free] = q[member.inverse.free]
+        for member in self.goal.nearest_members(q) if isinstance(self.goal, AnyGoal) else (self.goal,):
+            near, free = self.start.copy(), member.inverse.free
+            near[free] = q[free]  # joints that move none of the frames stay
             end: Array = member.inverse.descend(near, tolerance=TOLERANCE).states[0]
-            if np.abs(end - q).max() <= NEAR and within(member.errors(end), member.bounds):
+            if np.abs(end - q)[free].max(initial=0.0) <= NEAR and within(member.errors(end), member.bounds):
                 kept: Array = self.held_at_start(end[None])[0]
                 return kept
         return None
