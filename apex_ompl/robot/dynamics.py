@@ -9,12 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from apex_ompl.robot.model import Robot
-from apex_ompl.types import Array
+from apex_ompl.types import Array, Flags
+from apex_ompl.util.cache import kept
+
+MOST_LOCKED = 4  # models with fixed joints that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,10 +39,21 @@ class Load:
     inertia: Array
 
 
+class _Locked(NamedTuple):
+    """A model in which some joints are fixed, its data, and the places in the state of those that are left."""
+
+    model: pin.Model
+    data: pin.Data
+    states: NDArray[np.intp]
+
+
 class Dynamics:
     """Torques of the planned joints and speeds of points, for states in the order of the robot's."""
 
-    def __init__(self, robot: Robot, loads: Sequence[Load] = (), points: Mapping[str, tuple[str, Array]] | None = None):
+    def __init__(
+        self, robot: Robot, loads: Sequence[Load] = (), points: Mapping[str, tuple[str, Array]] | None = None,
+        needed: Flags | None = None,
+    ) -> None:  # fmt: skip
         """Make the model.
 
         Args:
@@ -45,6 +61,8 @@ class Dynamics:
             loads: What it holds.
             points: Name -> link and position in the frame of the link, shape (3,) [m], of points whose speeds are asked
                 for.
+            needed: Planned joints whose torques are asked for, shape (dof,); all by default. Where the others, such as
+                those of hands, rest, their torques are given as 0 and the model has links in the place of their joints.
 
         Raises:
             UnknownNameError: There is no such link.
@@ -62,6 +80,8 @@ class Dynamics:
             added = pin.Frame(f"point of {name}", frame.parentJoint, 0, place, pin.FrameType.OP_FRAME)
             self._points.append(self._model.addFrame(added, False))
         self._data = self._model.createData()
+        self._unneeded = np.empty(0, np.intp) if needed is None else np.flatnonzero(~needed)
+        self._locked: dict[bytes, _Locked] = {}  # by the values of the joints that rest
 
     @property
     def mass(self) -> float:
@@ -77,13 +97,33 @@ class Dynamics:
             a: Accelerations, shape (N, dof); zero by default.
         """
         still = np.zeros_like(q)
-        order = self.robot.to_pinocchio
-        rows = zip(*(order(still if some is None else some) for some in (q, v, a)), strict=True)
-        model, data = self._model, self._data
-        found = np.array([pin.rnea(model, data, *row) for row in rows]).reshape(q.shape)
-        torques = np.empty_like(found)
-        torques[:, self.robot.state_order] = found
+        motion = [still if some is None else some for some in (q, v, a)]
+        if self._rest(*motion):
+            model, data, states = self._locked_at(q[0])
+        else:
+            model, data, states = self._model, self._data, self.robot.state_order
+        rows = zip(*(some[:, states] for some in motion), strict=True)
+        torques = np.zeros_like(still)
+        torques[:, states] = np.array([pin.rnea(model, data, *row) for row in rows]).reshape(len(q), len(states))
         return torques
+
+    def _rest(self, q: Array, v: Array, a: Array) -> bool:
+        """Whether joints whose torques are not needed are there, and rest."""
+        some = self._unneeded
+        if not len(some) or not len(q) or v[:, some].any() or a[:, some].any():
+            return False
+        return bool((q[:, some] == q[0, some]).all())
+
+    def _locked_at(self, q: Array) -> _Locked:
+        """Return the model in which joints whose torques are not needed are fixed at a state, shape (dof,)."""
+        return kept(self._locked, q[self._unneeded].tobytes(), lambda: self._made_locked(q), MOST_LOCKED)
+
+    def _made_locked(self, q: Array) -> _Locked:
+        model, order = self._model, self.robot.state_order
+        places = {int(np.flatnonzero(order == k)[0]) for k in self._unneeded}
+        fixed = [k for k in range(1, model.njoints) if model.joints[k].idx_q in places]
+        reduced = pin.buildReducedModel(model, fixed, self.robot.to_pinocchio(q))
+        return _Locked(reduced, reduced.createData(), np.array([k for p, k in enumerate(order) if p not in places]))
 
     def inertias(self, q: Array) -> Array:
         """Return the inertia matrices M(q) of the planned joints, shape (N, dof, dof) [kg m^2], for states (N, dof)."""

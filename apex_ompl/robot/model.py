@@ -31,7 +31,9 @@ from apex_ompl.scene.bodies import Body
 from apex_ompl.scene.meshes import extent_fault
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.arrays import narrowed
+from apex_ompl.util.cache import weakly_cached
 from apex_ompl.util.display import counted, html_table, one_line
+from apex_ompl.util.forking import ProcessLock
 from apex_ompl.util.schema import StrictModel
 from apex_ompl.util.validation import degrees_hint, number_array, shape_error
 
@@ -223,10 +225,11 @@ class Robot:
             UnknownNameError: No such link.
             ParameterError: The state has another shape.
         """
-        frame = self.link_frame(link)
-        data = self.model.createData()
-        pin.framesForwardKinematics(self.model, data, self.to_pinocchio(q))
-        return np.array(data.oMf[frame].homogeneous)
+        frame = self.model.frames[self.link_frame(link)]
+        lock, data = _data_of(self.model)
+        with lock:
+            pin.forwardKinematics(self.model, data, self.to_pinocchio(q))
+            return np.array((data.oMi[frame.parentJoint] * frame.placement).homogeneous)
 
     def part_of(self, link: str) -> str:
         """Return the part that a link belongs to.
@@ -248,6 +251,12 @@ class Robot:
         Raises:
             UnknownNameError: No such link.
         """
+        known = _hands_of(self.model)
+        if link not in known:
+            known[link] = self._hand_of(link)
+        return known[link]
+
+    def _hand_of(self, link: str) -> tuple[str, ...]:
         model = self.model
         joint = model.frames[self.link_frame(link)].parentJoint
         while joint > 0 and model.joints[joint].nq == 0:
@@ -513,6 +522,18 @@ def weights_of(limits: Limits, turning: Flags) -> Array:
     speed = float(np.median(limits.velocity[turning])) if turning.any() else SPEED
     most = np.maximum(TURN / (limits.upper - limits.lower), 1.0)
     return np.where(turning, 1.0, np.minimum(speed / limits.velocity, most))
+
+
+@weakly_cached
+def _data_of(model: pin.Model) -> tuple[ProcessLock, pin.Data]:
+    """Return Pinocchio's data of a model, and the lock of those who use it."""
+    return ProcessLock(), model.createData()
+
+
+@weakly_cached
+def _hands_of(model: pin.Model) -> dict[str, tuple[str, ...]]:
+    """Return the hands that links belong to, as far as they are known; robots of one model share them."""
+    return {}
 
 
 _digests: WeakKeyDictionary[Robot, str] = WeakKeyDictionary()

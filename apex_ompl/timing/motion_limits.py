@@ -84,7 +84,7 @@ class MotionLimits:
         else:
             self.tool_speed = dict.fromkeys(points, tool_speed)
         tools = {name: _point(robot, name, points, "tool") for name in self.tool_speed}
-        self.dynamics = Dynamics(robot, loads, tools)
+        self.dynamics = Dynamics(robot, loads, tools, np.isfinite(self.torque))
         if self._limited.size and not self.dynamics.mass > 0.0:
             raise RobotError(f"no link of {robot.name} has a mass, as limits of torque need")
         self._speed = np.array(list(self.tool_speed.values()))

@@ -147,3 +147,19 @@ def test_the_masses_of_the_arms_are_believable(robot: Robot) -> None:
 def test_links_that_do_not_exist_are_named(robot: Robot) -> None:
     with pytest.raises(UnknownNameError, match="link 'left_hand_plam'"):
         Dynamics(robot, [Load("left_hand_plam", 1.0, np.zeros(3), np.eye(3))])
+
+
+def test_torques_that_are_needed_do_not_change_where_hands_rest() -> None:
+    robot, rng = load_robot("dual_panda_softhand"), np.random.default_rng(8)
+    needed = np.isfinite(robot.effort)
+    some, every = Dynamics(robot, [LOAD], needed=needed), Dynamics(robot, [LOAD])
+    assert not needed.all()
+    for _ in range(3):
+        q, (v, a) = robot.random_state(rng, 5), rng.normal(size=(2, 5, robot.dof))
+        q[:, ~needed], v[:, ~needed], a[:, ~needed] = q[0, ~needed], 0.0, 0.0
+        for given in ((q, v, a), (q, None, a), (q,)):
+            np.testing.assert_allclose(some.torques(*given)[:, needed], every.torques(*given)[:, needed], atol=1e-11)
+            assert not some.torques(*given)[:, ~needed].any()
+        for moved in (q, v, a):
+            moved[-1, -1] += 0.01
+            np.testing.assert_array_equal(some.torques(q, v, a), every.torques(q, v, a))
