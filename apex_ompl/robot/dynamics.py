@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from apex_ompl.robot.model import Robot
 from apex_ompl.types import Array, Flags
 from apex_ompl.util.cache import kept
+from apex_ompl.util.forking import ProcessLock
 
+MOST_KEPT = 32  # dynamics of all robots
 MOST_LOCKED = 4  # models with fixed joints that are kept
 
 
@@ -81,7 +83,8 @@ class Dynamics:
             self._points.append(self._model.addFrame(added, False))
         self._data = self._model.createData()
         self._unneeded = np.empty(0, np.intp) if needed is None else np.flatnonzero(~needed)
-        self._locked: dict[bytes, _Locked] = {}  # by the values of the joints that rest
+        self._locked: dict[str, _Locked] = {}  # by the values of the joints that rest
+        self._lock = ProcessLock()  # of data
 
     @property
     def mass(self) -> float:
@@ -104,7 +107,8 @@ class Dynamics:
             model, data, states = self._model, self._data, self.robot.state_order
         rows = zip(*(some[:, states] for some in motion), strict=True)
         torques = np.zeros_like(still)
-        torques[:, states] = np.array([pin.rnea(model, data, *row) for row in rows]).reshape(len(q), len(states))
+        with self._lock:
+            torques[:, states] = np.array([pin.rnea(model, data, *row) for row in rows]).reshape(len(q), len(states))
         return torques
 
     def _rest(self, q: Array, v: Array, a: Array) -> bool:
@@ -116,7 +120,7 @@ class Dynamics:
 
     def _locked_at(self, q: Array) -> _Locked:
         """Return the model in which joints whose torques are not needed are fixed at a state, shape (dof,)."""
-        return kept(self._locked, q[self._unneeded].tobytes(), lambda: self._made_locked(q), MOST_LOCKED)
+        return kept(self._locked, q[self._unneeded].tobytes().hex(), lambda: self._made_locked(q), MOST_LOCKED)
 
     def _made_locked(self, q: Array) -> _Locked:
         model, order = self._model, self.robot.state_order
@@ -130,7 +134,8 @@ class Dynamics:
         model, data, order = self._model, self._data, self.robot.state_order
         found = np.empty((len(q), len(order), len(order)))
         for matrix, row in zip(found, self.robot.to_pinocchio(q), strict=True):
-            upper = np.triu(pin.crba(model, data, row))
+            with self._lock:
+                upper = np.triu(pin.crba(model, data, row))
             matrix[np.ix_(order, order)] = upper + np.triu(upper, 1).T
         return found
 
@@ -157,7 +162,33 @@ class Dynamics:
         model, data, order = self._model, self._data, self.robot.to_pinocchio
         velocities = np.empty((len(q), len(self._points), 3))
         for row, *at in zip(velocities, order(q), order(v), strict=True):
-            pin.forwardKinematics(model, data, *at)
-            for n, frame in enumerate(self._points):
-                row[n] = pin.getFrameVelocity(model, data, frame, pin.LOCAL).linear
+            with self._lock:
+                pin.forwardKinematics(model, data, *at)
+                for n, frame in enumerate(self._points):
+                    row[n] = pin.getFrameVelocity(model, data, frame, pin.LOCAL).linear
         return np.asarray(np.linalg.norm(velocities, axis=2))
+
+
+def kept_dynamics(
+    robot: Robot, loads: Sequence[Load], points: Mapping[str, tuple[str, Array]], needed: Flags
+) -> Dynamics:  # fmt: skip
+    """Return the dynamics of a robot, which are kept: plans ask for those of the same held objects many times.
+
+    Args are those of :class:`Dynamics`.
+
+    Raises:
+        UnknownNameError: There is no such link.
+    """
+    content = (
+        id(robot.model),  # of a robot that is kept as well
+        *((load.link, load.mass, _hex(load.center), _hex(load.inertia)) for load in loads),
+        *((name, link, _hex(position)) for name, (link, position) in points.items()), _hex(needed),
+    )  # fmt: skip
+    return kept(_known, repr(content), lambda: Dynamics(robot, loads, points, needed), MOST_KEPT)
+
+
+_known: dict[str, Dynamics] = {}  # by robot and content
+
+
+def _hex(array: Array | Flags) -> str:
+    return np.ascontiguousarray(array).tobytes().hex()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from apex_ompl.collision.mass import held_load
 from apex_ompl.errors import RobotError, UnknownNameError
 from apex_ompl.kernel.timing import PathRows
-from apex_ompl.robot.dynamics import Dynamics, Load
+from apex_ompl.robot.dynamics import Load, kept_dynamics
 from apex_ompl.robot.model import Robot
 from apex_ompl.scene.bodies import AttachedObject
 from apex_ompl.timing.curve import Polyline
@@ -84,7 +84,7 @@ class MotionLimits:
         else:
             self.tool_speed = dict.fromkeys(points, tool_speed)
         tools = {name: _point(robot, name, points, "tool") for name in self.tool_speed}
-        self.dynamics = Dynamics(robot, loads, tools, np.isfinite(self.torque))
+        self.dynamics = kept_dynamics(robot, loads, tools, np.isfinite(self.torque))
         if self._limited.size and not self.dynamics.mass > 0.0:
             raise RobotError(f"no link of {robot.name} has a mass, as limits of torque need")
         self._speed = np.array(list(self.tool_speed.values()))
