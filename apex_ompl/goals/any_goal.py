@@ -33,6 +33,7 @@ DESCENTS = 1024  # of the first search, for all goals together, within the numbe
 LEAST_DESCENTS, MOST_DESCENTS = 4, 32  # for each
 OF_ARM = 4  # states of an arm at a pose that are combined with those of others
 EXAMINED = 4  # goals that are sampled in full: those with the nearest free states
+ENOUGH = 32  # free states of the first search with which none is
 UNTRIED = 12  # the same where the first search found no free state
 NEAREST = 3  # goals that are the nearest to a state
 SHARE = 2  # states that are returned, as a multiple of those for a goal alone
@@ -168,7 +169,8 @@ class AnyGoal:
             max_attempts: Most descents from random states for each goal that is sampled in full.
         """
         first = self._first(checker, rng)
-        found = [single.sample(self.members[k], checker, rng, count, max_attempts) for k in first.order]
+        order = [] if len(first.states) >= ENOUGH else first.order
+        found = [single.sample(self.members[k], checker, rng, count, max_attempts) for k in order]
         states = np.concatenate([first.states, *(one.states for one in found)])
         states = self._nearest(states, SHARE * count)
         attempts = first.attempts + sum(one.attempts for one in found)

@@ -25,7 +25,7 @@ from apex_ompl.planning.task_steps import StepPlanner
 from apex_ompl.planning.task_waypoints import StepFailed
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
-from apex_ompl.scene.steps import BodiesStep, DetachStep, GraspStep, HandedStep, StraightStep, TogetherStep
+from apex_ompl.scene.steps import BodiesStep, DetachStep, HandedStep, StraightStep, TogetherStep
 from apex_ompl.types import Array
 from apex_ompl.util.forking import unforked
 
@@ -144,7 +144,7 @@ class Rehearsal:
             end = self._tracked(step, world, q)
             return world.after(step, end), end
         if isinstance(step, HandedStep):
-            during = world.grasped(step, q) if isinstance(step, GraspStep) else world
+            during = world.during(step, q)
             end = self.planner.hand_end(during, step, q)
             self.planner.proved(during, end[None])
             return world.after(step, end), end
@@ -153,8 +153,14 @@ class Rehearsal:
             self.planner.proved(world if isinstance(step, DetachStep) else after, q[None])
             return after, q
         if isinstance(step, TogetherStep):
-            ends = [self._step(one, world, q)[1] for one in step.steps]
+            hands = [one for one in step.steps if isinstance(one, HandedStep)]
+            if len(hands) == len(step.steps):  # proved at once
+                ends = [self.planner.hand_end(world.during(one, q), one, q) for one in hands]
+            else:
+                ends = [self._step(one, world, q)[1] for one in step.steps]
             end = q + sum((one - q for one in ends), np.zeros(len(q)))
+            if len(hands) == len(step.steps):
+                self.planner.proved(world.during(step, q), end[None])
             return world.after(step, end), end
         return world.after(step, q), q
 

@@ -33,7 +33,6 @@ from apex_ompl.scene.steps import (
     LineStep,
     RetreatStep,
     StraightStep,
-    TakingStep,
     TogetherStep,
     TurnStep,
     WaitStep,
@@ -215,12 +214,17 @@ class StepPlanner:
             deviation=0.0 if found.trajectory is None else found.deviation,
         )  # fmt: skip
 
-    def _hand(self, world: TaskWorld, step: HandedStep, q: Array, timing: Timing | None) -> StepPlan:
-        """Return a hand that opens or closes."""
-        during = world.grasped(step, q) if isinstance(step, GraspStep) else world
+    def _hand(
+        self, world: TaskWorld, step: HandedStep, q: Array, timing: Timing | None, *, proves: bool = True
+    ) -> StepPlan:  # fmt: skip
+        """Return a hand that opens or closes, with its proof or without."""
+        during = world.during(step, q)
         end = self.hand_end(during, step, q)
         states = np.stack([q, end]) if (end != q).any() else q[None]
-        return self._proved(StepPlan(step, during, world.after(step, end), Path(states), None, nan), timing)
+        plan = StepPlan(step, during, world.after(step, end), Path(states), None, nan)
+        if proves:
+            return self._proved(plan, timing)
+        return plan if timing is None else self._timed(plan, timing, proves=False)
 
     def hand_end(self, during: TaskWorld, step: HandedStep, q: Array) -> Array:
         """Return the state after a hand has opened or closed, shape (dof,).
@@ -250,15 +254,17 @@ class StepPlanner:
 
     def _together(self, world: TaskWorld, step: TogetherStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return steps that start at once, each planned while the others rest, and proved together."""
-        plans = [self.plan(world, one, q, timing) for one in step.steps]
+        hands = [one for one in step.steps if isinstance(one, HandedStep)]
+        if len(hands) == len(step.steps):
+            plans = [self._hand(world, one, q, timing, proves=False) for one in hands]
+        else:
+            plans = [self.plan(world, one, q, timing) for one in step.steps]
         columns = [set(np.flatnonzero((plan.path.states != q).any(axis=0)).tolist()) for plan in plans]
         shared = [k for k in range(len(q)) if sum(k in moved for moved in columns) > 1]
         if shared:
             raise StepFailed(f"two of them move {self.robot.joint_names[shared[0]]}")
-        during, after, end = world, world, q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
-        for one in step.steps:
-            during = during.after(one, q) if isinstance(one, TakingStep) else during
-            after = after.after(one, end)
+        during, end = world.during(step, q), q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
+        after = world.after(step, end)
         motions = [plan.motion for plan in plans if plan.motion is not None]
         motion = superposed([(one, 0.0) for one in motions]) if len(motions) == len(plans) else None
         path = Path(abreast([plan.path.states for plan in plans]))
@@ -303,8 +309,8 @@ class StepPlanner:
             raise StepFailed(str(error)) from None
         return float(np.floor(closed.synergy * 1e3) / 1e3)
 
-    def _timed(self, plan: StepPlan, timing: Timing) -> StepPlan:
-        """Return a step with its motion.
+    def _timed(self, plan: StepPlan, timing: Timing, *, proves: bool = True) -> StepPlan:
+        """Return a step with its motion, which is proved unless it is proved with others later.
 
         Raises:
             StepFailed: There is none in time.
@@ -318,6 +324,8 @@ class StepPlanner:
             over = [f"{name} {share:.4f}" for name, share in motion.use(scaled).items() if share > 1.0 + ROUNDING]
             if over:
                 return f"the share of a limit that it uses is over 1: {', '.join(over)}"
+            if not proves:
+                return ""
             check = full_check(self.checker, motion, states[0], states[-1:], deadline=self._deadline.at)
             clear.append(nan if check.proof is None else check.proof.clearance)
             return check.reason

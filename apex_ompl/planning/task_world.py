@@ -171,6 +171,13 @@ class TaskWorld:
             return replace(self, leaving={hand: names for hand, names in self.leaving.items() if hand != step.hand})
         return self
 
+    def during(self, step: Step, q: Array) -> TaskWorld:
+        """Return the world during a step of hands that starts in a state, shape (dof,): with what it takes."""
+        world = self
+        for one in step.steps if isinstance(step, TogetherStep) else (step,):
+            world = world.grasped(one, q) if isinstance(one, TakingStep) else world
+        return world
+
     def _without(self, names: Sequence[str]) -> TaskWorld:
         """Return the world without obstacles and fixtures; pairs of obstacles that may touch are forgotten."""
         known = {**{body.name: body for body in self.robot.fixtures}, **self.scene}
