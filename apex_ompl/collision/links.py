@@ -11,6 +11,7 @@ from apex_ompl.collision.solids import Solid
 from apex_ompl.collision.tables import tabulate
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.scene_builder import scene_tables
+from apex_ompl.kernel.tables import no_balls
 from apex_ompl.robot import Robot
 from apex_ompl.types import Array
 
@@ -43,7 +44,8 @@ class Links(NamedTuple):
         solids = [stage.solids[k] for k in range(stage.links)]
         tables = tabulate(
             robot, solids=solids, numbers=range(stage.links), pairs=stage.body_pairs,
-            covers=covers_of(robot, [solid.shape for solid in solids]), meets_scene=[False] * stage.links,
+            covers=covers_of(robot, [solid.shape for solid in solids]), inner=[no_balls()] * stage.links,
+            meets_scene=[False] * stage.links,
         )  # fmt: skip
         return cls(Kernel(tables, scene_tables([])), solids, list(stage.body_pairs))
 

@@ -24,6 +24,7 @@ from apex_ompl.collision.clearance_tables import clearance_digests, clearances_o
 from apex_ompl.collision.containment import EnclosingMesh
 from apex_ompl.collision.cover.proof import Cover
 from apex_ompl.collision.cover.quick import bounding_boxes, covers_of
+from apex_ompl.collision.cover.spheres import shape_key
 from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays, shape_digest
 from apex_ompl.collision.inner_balls import inner_balls
 from apex_ompl.collision.shapes import cloud_of, is_surface
@@ -53,14 +54,17 @@ from apex_ompl.robot import Robot
 from apex_ompl.scene.meshes import triangles
 from apex_ompl.types import Array
 from apex_ompl.util.arrays import length
-from apex_ompl.util.cache import stored, weakly_cached
+from apex_ompl.util.cache import kept, stored, weakly_cached
 from apex_ompl.util.files import read_file
 
 PROBE = 1e-3  # value of a planned joint at which axes and ratios are measured: no joint turns by half a turn or more
 CHECKS = (0.37, -1.13, 2.71)  # values at which they are checked, besides the limits
 FOLDER = "robots"
 PACKAGES = ("collision", "kernel", "robot", "scene", "util")  # whose code makes tables
+MOST_ROBOTS = 16  # whose balls are kept
 R = TypeVar("R")
+
+_inner: dict[str, list[Array]] = {}  # balls inside of the links of robots, by a digest of their shapes
 
 
 @weakly_cached
@@ -126,6 +130,7 @@ def tabulate(
     solids: Sequence[Solid],
     numbers: Sequence[int],
     covers: Sequence[Cover],
+    inner: Sequence[Array],
     meets_scene: Sequence[bool],
     pairs: Iterable[tuple[int, int]],
     clearances: Mapping[tuple[int, int], ClearanceTable] | None = None,
@@ -137,6 +142,7 @@ def tabulate(
         solids: Its links and held objects.
         numbers: Number of each outside of the tables.
         covers: The cover of each.
+        inner: Centers and radii of balls inside of each, shape (k, 4) [m].
         meets_scene: Whether each is checked against obstacles.
         pairs: Pairs that are checked for self-collision, by their places in ``solids``.
         clearances: Tables of clearances of some of them.
@@ -144,9 +150,9 @@ def tabulate(
     bodies = [
         BodySpec(
             solid.part or solid.name, solid.joint, solid.placement.homogeneous, cover.centers, cover.radii,
-            cover.first, cover.count, inner_balls(solid.shape) if meets else no_balls(), meets,
+            cover.first, cover.count, balls if meets else no_balls(), meets,
         )
-        for solid, cover, meets in zip(solids, covers, meets_scene, strict=True)
+        for solid, cover, balls, meets in zip(solids, covers, inner, meets_scene, strict=True)
     ]  # fmt: skip
     limits = robot.limits
     return robot_tables(
@@ -208,9 +214,12 @@ def make_tables(
         FileFormatError: That file, or that of clearance tables, does not follow its schema.
         RobotError: The kernel does not support the motion of a joint.
     """
-    covers = covers_of(robot, [solid.shape for solid in solids])
+    shapes = [solid.shape for solid in solids]
+    links = len(robot.geometry.geometryObjects)
+    inner = [*stored_inner_balls(shapes[:links]), *map(inner_balls, shapes[links:])]
     return tabulate(
-        robot, solids=solids, numbers=range(len(solids)), covers=covers, meets_scene=meets_scene, pairs=pairs,
+        robot, solids=solids, numbers=range(len(solids)), covers=covers_of(robot, shapes), inner=inner,
+        meets_scene=meets_scene, pairs=pairs,
         clearances=clearances_of(robot, joint_tree(robot), solids, pairs),
     )  # fmt: skip
 
@@ -241,6 +250,22 @@ def stored_tables(
 
     about, arrays = _stored("tables", parts, RobotArrays, make)
     return RobotTables(robot.name, robot.joint_names, tuple(about["bodies"]), tuple(about["numbers"]), arrays)
+
+
+def stored_inner_balls(shapes: Sequence[coal.CollisionGeometry]) -> list[Array]:
+    """Return the balls inside of links (:func:`apex_ompl.collision.inner_balls.inner_balls`), by the cache."""
+    keys = [shape_key(shape) for shape in shapes]
+
+    def make() -> tuple[dict[str, Any], dict[str, Any]]:
+        found = [inner_balls(shape) for shape in shapes]
+        return {"counts": [len(balls) for balls in found]}, {"balls": np.concatenate([np.empty((0, 4)), *found])}
+
+    def read(about: dict[str, Any], arrays: dict[str, Any]) -> list[Array]:
+        ends = np.cumsum(about["counts"])
+        return [arrays["balls"][end - count : end] for end, count in zip(ends, about["counts"], strict=True)]
+
+    digest = hashlib.sha256(_code() + "".join(keys).encode()).hexdigest()[:32]
+    return kept(_inner, digest, lambda: stored(FOLDER, f"inner-{digest}", make, read), MOST_ROBOTS)
 
 
 def stored_shapes(placed: Sequence[PlacedShape]) -> ShapeArrays:

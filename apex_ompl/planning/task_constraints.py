@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from apex_ompl.constraints.constraint_set import ConstraintSet
-from apex_ompl.constraints.proof import ConstraintCertificate, prove_motion, prove_path
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.bodies import AttachedObject
@@ -20,6 +19,9 @@ from apex_ompl.scene.steps import Step, TurnStep
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
+if TYPE_CHECKING:  # they load compiled code that most tasks do without
+    from apex_ompl.constraints.constraint_set import ConstraintSet
+    from apex_ompl.constraints.proof import ConstraintCertificate
 
 @dataclass(eq=False)
 class StepConstraints:
@@ -56,6 +58,8 @@ class StepConstraints:
         held = self._of(world)
         if held is None:
             return None
+        from apex_ompl.constraints.proof import prove_motion, prove_path
+
         return prove_path(held, states) if motion is None else prove_motion(held, motion)
 
     def _of(self, world: TaskWorld) -> ConstraintSet | None:
