@@ -36,7 +36,19 @@ from apex_ompl.util.cache import kept, weakly_cached
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centers are no deeper than this below it [m]
 MANY = 4000  # triangles
 LARGE_HULL = 24  # corners, from which a search by neighbors is faster than one of all
-
+# Fields with a row for each shape.
+OF_EACH = (
+    "kind",
+    "joint",
+    "points_of",
+    "root",
+    "graph",
+    "rotation",
+    "offset",
+    "size",
+    "ball",
+    "depth",
+)  # with a row each
 
 MOST_MESHES = 256  # that are kept
 
@@ -247,6 +259,12 @@ def joined(bodies: ShapeArrays, obstacles: ShapeArrays) -> ShapeArrays:
         corner=np.where(obstacles.corner <= POINT, obstacles.corner - points, _moved(obstacles.corner, points)),
     )  # fmt: skip
     return ShapeArrays(*(np.concatenate(pair) for pair in zip(bodies, moved, strict=True)))
+
+
+def rearranged(shapes: ShapeArrays, order: Sequence[int]) -> ShapeArrays:
+    """Return shapes in another order, given by their places in this one."""
+    chosen = np.array(order, np.int64)
+    return shapes._replace(**{name: getattr(shapes, name)[chosen] for name in OF_EACH})
 
 
 def _moved(numbers: Integers, by: int) -> Integers:

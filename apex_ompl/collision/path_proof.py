@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from apex_ompl.collision.exact_shapes import PlacedShape, joined, shape_arrays
+from apex_ompl.collision.exact_shapes import PlacedShape, joined, rearranged, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
 from apex_ompl.collision.tables import joint_tree, stored_shapes
@@ -41,6 +41,7 @@ BUDGET = 1000  # intervals between two readings of the clock: some milliseconds
 
 MOST_SCENES = 2  # whose packed shapes are kept
 
+_links: WeakKeyDictionary[Robot, ShapeArrays] = WeakKeyDictionary()
 _bodies: WeakKeyDictionary[Robot, OrderedDict[int, tuple[Array, ShapeArrays]]] = WeakKeyDictionary()
 
 
@@ -137,16 +138,24 @@ def obstacles_alone(kernel: Kernel, chosen: Flags) -> Kernel:
 
 
 def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeArrays:
-    """Return the shapes of a kernel's bodies; those of the last sets of held objects are kept."""
+    """Return the shapes of a kernel's bodies; those of the links, and of the last sets of held objects, are kept."""
     known = _bodies.setdefault(robot, OrderedDict())
     key = id(kernel.robot.arrays.node_center)  # shared by all kernels of one set of bodies
     if key not in known:
         turns = [turn.T for turn in joint_tree(robot).turns]
-        solids = [scene.solids[number] for number in kernel.robot.numbers]
-        bodies = [PlacedShape(s.shape, s.joint, product(turns[s.joint], s.placement.homogeneous)) for s in solids]
+
+        def placed(numbers: Iterable[int]) -> list[PlacedShape]:
+            solids = (scene.solids[number] for number in numbers)
+            return [PlacedShape(s.shape, s.joint, product(turns[s.joint], s.placement.homogeneous)) for s in solids]
+
+        if robot not in _links:
+            _links[robot] = stored_shapes(placed(range(scene.links)))
+        held = [number for number in kernel.robot.numbers if number >= scene.links]
+        rows = {number: scene.links + k for k, number in enumerate(held)}
+        order = [rows.get(number, number) for number in kernel.robot.numbers]
         while len(known) >= MOST_PACKED:
             known.popitem(last=False)
-        arrays = (shape_arrays if known else stored_shapes)(bodies)
+        arrays = rearranged(joined(_links[robot], shape_arrays(placed(held))), order)
         known[key] = kernel.robot.arrays.node_center, arrays
     return known[key][1]
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # they load compiled code that most tasks do without
     from apex_ompl.constraints.constraint_set import ConstraintSet
     from apex_ompl.constraints.proof import ConstraintCertificate
 
+
 @dataclass(eq=False)
 class StepConstraints:
     """The constraints that hold in each world of a task.
