@@ -36,6 +36,7 @@ EXAMINED = 4  # goals that are sampled in full: those with the nearest free stat
 ENOUGH = 32  # free states of the first search with which none is
 UNTRIED = 12  # the same where the first search found no free state
 NEAREST = 3  # goals that are the nearest to a state
+ROUNDING = 1e-9  # of distances [m]
 SHARE = 2  # states that are returned, as a multiple of those for a goal alone
 
 
@@ -106,10 +107,14 @@ class AnyGoal:
             least = 0.0 if within(errors, bounds) else min(least, relative_error(errors, bounds))
         return {ANY: least}
 
-    def _errors(self, q: Array) -> Iterator[tuple[int, Mapping[str, float], Mapping[str, float]]]:
-        """Yield number, errors at a state and bounds of each goal; of those with the same poses, of the first alone."""
+    def _errors(
+        self, q: Array, some: set[int] | None = None
+    ) -> Iterator[tuple[int, Mapping[str, float], Mapping[str, float]]]:
+        """Yield number, errors at a state and bounds of goals; of those with the same poses, of the first alone."""
         placed = dict[object, list[Array]]()
         for k in self._distinct:
+            if some is not None and k not in some:
+                continue
             goal = self.members[k]
             if isinstance(goal, PoseGoal):
                 if goal.where not in placed:
@@ -155,7 +160,33 @@ class AnyGoal:
 
     def member_of(self, q: Array) -> int:
         """Return the number of the first goal that a state, shape (dof,), reaches, or -1 of a joint configuration."""
-        return next((k for k, errors, bounds in self._errors(q) if within(errors, bounds)), -1)
+        return next((k for k, errors, bounds in self._errors(q, self._near(q)) if within(errors, bounds)), -1)
+
+    def _near(self, q: Array) -> set[int]:
+        """Return the numbers of the goals that may be reached at a state: those whose frames are near enough."""
+        found = {k for k, goal in enumerate(self.members) if not isinstance(goal, PoseGoal)}
+        for numbers, wanted, reach in self._origins:
+            goal = self.members[numbers[0]]
+            assert isinstance(goal, PoseGoal)
+            at = np.array([pose[:3, 3] for pose in goal.placements(q)])
+            found.update(numbers[(np.linalg.norm(wanted - at, axis=2) <= reach).all(axis=1)].tolist())
+        return found
+
+    @cached_property
+    def _origins(self) -> list[tuple[NDArray[np.intp], Array, Array]]:
+        """For poses of the same frames: numbers of the goals, origins, shape (n, frames, 3), and how far is inside."""
+        alike = dict[Hashable, list[int]]()
+        for k, goal in enumerate(self.members):
+            if isinstance(goal, PoseGoal):
+                alike.setdefault(goal.where, []).append(k)
+        found = []
+        for numbers in alike.values():
+            poses = [goal.poses for goal in (self.members[k] for k in numbers) if isinstance(goal, PoseGoal)]
+            wanted = np.array([[pose.position for pose in some] for some in poses])
+            corners = [[np.maximum(np.abs(pose.lower), np.abs(pose.upper)) for pose in some] for some in poses]
+            within = [[pose.tolerance.position for pose in some] for some in poses]
+            found.append((np.array(numbers), wanted, np.linalg.norm(corners, axis=2) + within + ROUNDING))
+        return found
 
     def sample(
         self, checker: CollisionChecker, rng: np.random.Generator, count: int = 8, max_attempts: int = 200
