@@ -74,6 +74,8 @@ class StepConstraints:
     def _made(self, constraints: Sequence[Constraint], kept: Sequence[AttachedObject]) -> ConstraintSet | None:
         if not constraints and not any(one.links for one in kept):
             return None
+        from apex_ompl.constraints.constraint_set import ConstraintSet
+
         start = self.problem.start_state(self.robot.joint_names)
         return ConstraintSet.of(self.robot, constraints, kept, start)
 
