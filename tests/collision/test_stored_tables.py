@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from apex_ompl.collision import CollisionChecker, tables
+from apex_ompl.collision.exact_shapes import PlacedShape, shape_arrays
 from apex_ompl.collision.path_proof import _shapes_of_bodies
 from apex_ompl.kernel.tables import RobotTables
 from apex_ompl.robot import Robot, load_robot
@@ -33,6 +34,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def fresh(name: str = "dual_panda_softhand") -> Robot:
     """A robot that no table is known of in this process."""
+    tables._inner.clear()
     path = DATA / f"{name}.robot.yaml"
     return build_robot(read_config(path), path)
 
@@ -69,7 +71,7 @@ def test_tables_from_the_cache_are_those_made_anew(
 ) -> None:
     held = (HELD.model_copy(update={"link": link}),) if link else ()
     made = tables_of(fresh(name), *held)
-    assert files_in(folder) == ["shapes", "tables"]
+    assert files_in(folder) == ["inner", "shapes", "tables"]
     with monkeypatch.context() as patch:
         patch.setattr(tables, "make_tables", None)
         patch.setattr(tables, "shape_arrays", None)
@@ -95,7 +97,7 @@ def test_a_damaged_file_is_made_anew(damage: str, folder: Path, caplog: pytest.L
             file.write_bytes(pieces[damage])
     with caplog.at_level(logging.WARNING, "apex_ompl"):
         assert_same(tables_of(fresh()), made)
-    wanted = 0 if damage == "a folder" else 2
+    wanted = 0 if damage == "a folder" else 3
     assert sum("makes a file of its cache anew" in record.message for record in caplog.records) == wanted
     caplog.clear()
     assert_same(tables_of(fresh()), made)
@@ -128,9 +130,9 @@ def test_changed_inputs_make_other_tables(folder: Path, tmp_path: Path, monkeypa
     """Limits, meshes, covers, what is held and where, and the code."""
     robot = fresh()
     tables_of(robot)
-    assert len(files_in(folder)) == 2
+    assert len(files_in(folder)) == 3
     moved = HELD.model_copy(update={"position": (0.0, 0.02, -0.06)})
-    for count, held in ((4, HELD), (6, moved)):
+    for count, held in ((4, HELD), (5, moved)):  # shapes of links are the same
         first = tables_of(fresh(), held)[0]
         assert len(files_in(folder)) == count
         assert "bar" in first.body_names
@@ -174,7 +176,27 @@ def test_only_the_first_tables_of_a_robot_are_kept(folder: Path) -> None:
     robot = fresh()
     tables_of(robot)
     assert "bar" in tables_of(robot, HELD)[0].body_names
-    assert files_in(folder) == ["shapes", "tables"]
+    assert files_in(folder) == ["inner", "shapes", "tables"]
+
+
+def test_bodies_have_the_shapes_of_links_and_held_objects() -> None:
+    """In the order of the tables, as if the shapes were all made at once."""
+    robot = fresh()
+    checker = CollisionChecker(robot, (), (HELD,))
+    checker.prepare()
+    kernel, scene = checker.kernel, checker._spheres.scene
+    found, turns = _shapes_of_bodies(robot, scene, kernel), [turn.T for turn in tables.joint_tree(robot).turns]
+    solids = [scene.solids[number] for number in kernel.robot.numbers]
+    wanted = shape_arrays([PlacedShape(s.shape, s.joint, turns[s.joint] @ s.placement.homogeneous) for s in solids])
+    for name in ("kind", "joint", "rotation", "offset", "size", "ball", "depth"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-14)
+    assert kernel.robot.body_names.index("bar") < len(solids) - 1
+    for k in range(len(solids)):
+        assert (found.root[k] >= 0) == (wanted.root[k] >= 0) and (found.graph[k] >= 0) == (wanted.graph[k] >= 0)
+        mine, theirs = (a.points[a.points_of[k, 0] :][: a.points_of[k, 1]] for a in (found, wanted))
+        np.testing.assert_array_equal(mine, theirs)
+        if wanted.root[k] >= 0:
+            np.testing.assert_array_equal(found.node_ball[found.root[k]], wanted.node_ball[wanted.root[k]])
 
 
 def test_the_files_used_least_lately_are_removed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,6 +94,24 @@ def test_pairs_of_poses_of_two_arms_are_reached_by_descents_of_each(robot: Robot
     assert goal.member_of(found.states[0]) == found.members[0]
 
 
+def test_the_goal_that_a_state_reaches_is_found_among_poses_and_regions(robot: Robot) -> None:
+    poses = near_home(robot, 5, 10, 0.1)
+    boxes = [one.model_copy(update={"lower": (-0.03, 0.0, 0.0), "upper": (0.02, 0.01, 0.0)}) for one in poses[:4]]
+    goals = [PoseGoal(robot, [pose], (), robot.home) for pose in (*poses[4:], *boxes, *poses)]
+    goal, rng = AnyGoal(robot, goals, np.empty((0, robot.dof)), robot.home), np.random.default_rng(0)
+    reached = set()
+    for k, one in enumerate(goals * 3):
+        offset = rng.uniform((-0.04, -0.01, 0.0), (0.03, 0.02, 0.0)) if k % 3 else np.zeros(3)
+        at = wanted_pose(one.poses[0]) * pin.SE3(np.eye(3), offset)
+        q = PoseGoal(robot, [target(at)], (), robot.home).inverse.descend(robot.home, tolerance=1e-9).states[0]
+        inside = [n for n, g in enumerate(goals) if all(g.errors(q)[name] <= g.bounds[name] for name in g.bounds)]
+        assert goal.member_of(q) == (inside or [-1])[0]
+        reached.add(goal.member_of(q))
+    assert -1 in reached and len(reached) > 6
+    exact = goals[3].inverse.descend(robot.home, tolerance=1e-9).states[0]
+    assert goal.nearest_members(exact)[0] is goals[3] and len(goal.nearest_members(exact)) == 3
+
+
 def test_two_poses_of_one_arm_are_reached_together(robot: Robot) -> None:
     states = (robot.home + np.random.default_rng(3).normal(0.0, 0.2, (4, robot.dof))).clip(
         robot.limits.lower, robot.limits.upper

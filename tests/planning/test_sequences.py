@@ -27,9 +27,12 @@ from apex_ompl import (
     plan_task,
 )
 from apex_ompl.cli.parser import main
+from apex_ompl.goals.any_goal import AnyGoal
 from apex_ompl.goals.grasp_goal import MOST, pose_alternatives
+from apex_ompl.goals.pose_goal import PoseGoal
 from apex_ompl.paths.path import abreast
 from apex_ompl.planning import TaskSearch
+from apex_ompl.planning.task_goals import task_goal
 from apex_ompl.planning.task_problem import sequence_problem
 from apex_ompl.planning.task_rehearsal import Rehearsal
 from apex_ompl.planning.task_result import load_result
@@ -37,6 +40,7 @@ from apex_ompl.planning.task_steps import StepPlanner
 from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.problems import cells
 from apex_ompl.scene import Goal, Problem
+from apex_ompl.scene.problem import MoveStep
 from apex_ompl.timing import Trajectory, time_path
 from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.rests import is_at_rest
@@ -205,6 +209,26 @@ def test_later_goals_are_rehearsed_with_the_joints_that_are_planned() -> None:
             (goal,) = Rehearsal(mine, 0, lambda: False, group).later_goals(0, world, robot.home)
             moved = [name for name, q, home in zip(robot.joint_names, goal, robot.home, strict=True) if q != home]
             assert moved and all(name.startswith(f"{side}_joint") for name in moved)
+
+
+def test_a_rehearsed_goal_is_kept_though_the_other_arm_is_elsewhere_and_other_poses_are_near() -> None:
+    with MotionPlanner() as planner:
+        robot = planner.robot
+        at, turn = planner.fk("home", "left_hand")[:3, 3], np.random.default_rng(2).normal(0.0, 0.01, robot.dof)
+        poses = [PoseTarget(frame="left_hand", position=tuple(at + (0.0, 0.0, z))) for z in (0.03, 0.035, 0.04)]
+        problem = sequence_problem(robot, planner.problem("home", "home"), [entry("move", goal=AnyOf(poses))])
+        goal = task_goal(robot, TaskWorld.of(robot, problem), problem, MoveStep(goal=problem.goal), robot.home)
+        assert isinstance(goal.goal, AnyGoal)
+        for member in goal.goal.members:
+            rehearsed = member.inverse.descend(robot.home, tolerance=1e-9).states[0]
+            rehearsed[7:] += 0.3  # the other arm and the hands
+            kept = goal.refined(rehearsed + np.where(np.arange(robot.dof) < 7, turn, 0.0))
+            assert kept is not None and np.array_equal(kept[7:], robot.home[7:])
+            reached = planner.fk(kept, "left_hand")[:3, 3]
+            assert isinstance(member, PoseGoal)
+            assert np.abs(reached - member.poses[0].position).max() < 1e-5  # and not a neighbor
+        far = rehearsed + 0.2
+        assert goal.refined(far) is None
 
 
 def test_what_cannot_be_done_is_counted_by_cause() -> None:
