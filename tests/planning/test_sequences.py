@@ -214,7 +214,7 @@ def test_later_goals_are_rehearsed_with_the_joints_that_are_planned() -> None:
 def test_a_rehearsed_goal_is_kept_though_the_other_arm_is_elsewhere_and_other_poses_are_near() -> None:
     with MotionPlanner() as planner:
         robot = planner.robot
-        at, turn = planner.fk("home", "left_hand")[:3, 3], np.random.default_rng(2).normal(0.0, 0.01, robot.dof)
+        at, turn = planner.fk("home", "left_hand")[:3, 3], np.random.default_rng(2).normal(0.0, 0.001, robot.dof)
         poses = [PoseTarget(frame="left_hand", position=tuple(at + (0.0, 0.0, z))) for z in (0.03, 0.035, 0.04)]
         problem = sequence_problem(robot, planner.problem("home", "home"), [entry("move", goal=AnyOf(poses))])
         goal = task_goal(robot, TaskWorld.of(robot, problem), problem, MoveStep(goal=problem.goal), robot.home)
