@@ -18,7 +18,7 @@ from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import load_robot
 from apex_ompl.scene.problem import Problem
-from apex_ompl.scene.steps import DetachStep, MotionStep, ReleaseStep, RetreatStep, Step, TakingStep, parts
+from apex_ompl.scene.steps import DetachStep, MotionStep, ReleaseStep, Step, TakingStep, parts
 from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.combination import superposed
 from apex_ompl.timing.trajectory import ROUNDING, joined
@@ -180,7 +180,7 @@ def _record(plan: StepPlan, begin: float, start: float, end: float, blended: boo
     """
     step, world, after = plan.step, plan.world, plan.after
     released, grasped = changes(step, world)
-    hands = [one.hand for one in parts([step]) if isinstance(one, RetreatStep)]
+    hands = world.leaving.keys() - after.leaving.keys()
     leaving = {pair for hand in hands for pair in world.leaving_pairs(hand)}
     gone = tuple(name for name in released if name not in after.scene and name not in after.held)
     left = plan.left if plan.motion is None else begin + plan.left

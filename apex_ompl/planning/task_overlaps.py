@@ -18,7 +18,6 @@ from typing import NamedTuple
 import numpy as np
 
 from apex_ompl.constraints.frames import holding_link
-from apex_ompl.constraints.links import Links
 from apex_ompl.errors import RobotError
 from apex_ompl.goals.arms import Arm, arms_of
 from apex_ompl.paths.path import Path
@@ -26,7 +25,7 @@ from apex_ompl.planning.task_motion import changes
 from apex_ompl.planning.task_result import AT_ONCE, StepTimes, TaskResult, TaskStep
 from apex_ompl.planning.task_steps import StepPlan, StepPlanner, most_used
 from apex_ompl.planning.task_waypoints import LATE, StepFailed
-from apex_ompl.planning.task_world import TaskWorld
+from apex_ompl.planning.task_world import TaskWorld, joints_above
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
 from apex_ompl.scene.steps import (
@@ -237,6 +236,8 @@ def _changed(
         for one in parts([placed[k].plan.step]):
             if done != isinstance(one, TakingStep):
                 world = world.after(one, motion(min(time, motion.duration)))
+        plan = placed[k].plan
+        world = world.left(plan.world.leaving.keys() - plan.after.leaving.keys() if done else plan.parted)
     return world
 
 
@@ -285,10 +286,10 @@ def _needs(robot: Robot, plan: StepPlan) -> _Needs | None:
     mine, objects = set[int]().union(*(arm.joints for arm in arms)), set[str]()
     for world in (plan.world, plan.after):
         objects.update(
-            name for name, held in world.held.items() if any(_above(robot, link) & mine for link in held.holders)
+            name for name, held in world.held.items() if any(joints_above(robot, link) & mine for link in held.holders)
         )
         left = world.leaving.items()
-        objects.update(n for hand, names in left if _above(robot, robot.hands[hand].palm) & mine for n in names)
+        objects.update(n for hand, names in left if joints_above(robot, robot.hands[hand].palm) & mine for n in names)
     objects.update(*(name for one in steps for name in changes(one, plan.world)))
     return _Needs(frozenset(arm.name for arm in arms), frozenset(objects))
 
@@ -308,14 +309,8 @@ def _arms_with(robot: Robot, moved: set[int], links: Sequence[str] = ()) -> list
         arms = arms_of(robot)
     except RobotError:  # it has none
         return None
-    above = [_above(robot, link) for link in links]
+    above = [joints_above(robot, link) for link in links]
     of_arms = set[int]().union(*(arm.joints for arm in arms))
     if not moved <= of_arms or not all(joints & of_arms for joints in above):
         return None
     return [arm for arm in arms if {*arm.joints} & moved.union(*above)]
-
-
-def _above(robot: Robot, link: str) -> set[int]:
-    """Return the planned joints that move a link."""
-    links = Links.of(robot)
-    return {*links.moved(links.point(link, np.zeros(3)).joint)}

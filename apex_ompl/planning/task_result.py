@@ -65,8 +65,8 @@ class TaskStep:
         scene: Obstacles during it, released objects among them.
         attached: Objects held during it.
         allowed: Pairs of bodies that may touch during it.
-        left: Time from which on a retreating hand is proved clear of what it released, or without a motion the number
-            of the state of ``path``; NaN of other steps.
+        left: Time from which on hands are proved clear of what they released, or without a motion the number of the
+            state of ``path``; NaN where they do not leave anything.
         leaving: Pairs among ``allowed`` that may touch until then only.
         released: Objects that its hand lets go of.
         grasped: Objects that its hand takes.

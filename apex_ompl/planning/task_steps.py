@@ -22,7 +22,7 @@ from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
 from apex_ompl.planning.task_constraints import StepConstraints
 from apex_ompl.planning.task_waypoints import LATE, StepFailed, check_near, held_pose, waypoints
-from apex_ompl.planning.task_world import TaskWorld
+from apex_ompl.planning.task_world import TaskWorld, joints_above
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
 from apex_ompl.scene.steps import (
@@ -30,12 +30,14 @@ from apex_ompl.scene.steps import (
     DetachStep,
     GraspStep,
     HandedStep,
+    HandStep,
     LineStep,
     RetreatStep,
     StraightStep,
     TogetherStep,
     TurnStep,
     WaitStep,
+    parts,
 )
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.combination import superposed
@@ -61,10 +63,11 @@ class StepPlan:
         path: Its path.
         motion: Its timed motion from rest to rest, or None where it is not timed.
         clearance: Least distance of a checked pair along the motion, or else along the path [m].
-        left: Time from which on, or state of the path from which on, a retreating hand touches nothing any more; NaN
-            of other steps.
+        left: Time from which on, or state of the path from which on, hands touch nothing any more of what they
+            released; NaN where they are not leaving anything.
         use: Largest share of each limit that the motion uses.
         deviation: Largest distance of the motion from the path [rad].
+        parted: Hands that have left what they released when it starts.
     """
 
     step: AnyStep
@@ -76,6 +79,7 @@ class StepPlan:
     left: float = nan
     use: Mapping[str, float] = field(default_factory=dict)
     deviation: float = 0.0
+    parted: frozenset[str] = frozenset()
 
     @property
     def end(self) -> Array:
@@ -155,7 +159,7 @@ class StepPlanner:
         if isinstance(step, RetreatStep):
             return self._retreat(world, step, q, timing)
         if isinstance(step, LineStep | TurnStep):
-            return self._line(world, step, q, timing)
+            return self.leaving(world, self._line(self.parted(world, step, q), step, q, timing))
         if isinstance(step, TogetherStep):
             return self._together(world, step, q, timing)
         if isinstance(step, BodiesStep):
@@ -218,13 +222,16 @@ class StepPlanner:
         self, world: TaskWorld, step: HandedStep, q: Array, timing: Timing | None, *, proves: bool = True
     ) -> StepPlan:  # fmt: skip
         """Return a hand that opens or closes, with its proof or without."""
+        before, world = world, self.parted(world, step, q) if isinstance(step, HandStep) else world
         during = world.during(step, q)
         end = self.hand_end(during, step, q)
         states = np.stack([q, end]) if (end != q).any() else q[None]
         plan = StepPlan(step, during, world.after(step, end), Path(states), None, nan)
         if proves:
-            return self._proved(plan, timing)
-        return plan if timing is None else self._timed(plan, timing, proves=False)
+            plan = self._proved(plan, timing)
+        elif timing is not None:
+            plan = self._timed(plan, timing, proves=False)
+        return self.leaving(before, plan) if isinstance(step, HandStep) else plan
 
     def hand_end(self, during: TaskWorld, step: HandedStep, q: Array) -> Array:
         """Return the state after a hand has opened or closed, shape (dof,).
@@ -263,8 +270,10 @@ class StepPlanner:
         shared = [k for k in range(len(q)) if sum(k in moved for moved in columns) > 1]
         if shared:
             raise StepFailed(f"two of them move {self.robot.joint_names[shared[0]]}")
-        during, end = world.during(step, q), q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
-        after = world.after(step, end)
+        end = q + sum((plan.end - q for plan in plans), np.zeros(len(q)))
+        parted = frozenset[str]().union(*(plan.parted for plan in plans))
+        gone = {hand for plan in plans for hand in plan.world.leaving.keys() - plan.after.leaving.keys()}
+        during, after = world.during(step, q).left(parted), world.after(step, end).left(parted | gone)
         motions = [plan.motion for plan in plans if plan.motion is not None]
         motion = superposed([(one, 0.0) for one in motions]) if len(motions) == len(plans) else None
         path = Path(abreast([plan.path.states for plan in plans]))
@@ -275,7 +284,7 @@ class StepPlanner:
         left = nan if not lefts else max(lefts) if motion is not None else float(len(path.states) - 1)
         return StepPlan(
             step, during, after, path, motion, clearance, left, use,
-            max(plan.deviation for plan in plans),
+            max(plan.deviation for plan in plans), parted,
         )  # fmt: skip
 
     def _kept_together(self, world: TaskWorld, timing: Timing, motion: Trajectory) -> dict[str, float]:
@@ -349,19 +358,70 @@ class StepPlanner:
         )
         return replace(found, motion=motion)
 
+    def parted(self, world: TaskWorld, step: AnyStep, q: Array) -> TaskWorld:
+        """Return the world of a step in which hands that touch nothing at a state have left what they released.
+
+        Hands that retreat later are left as they are: they may brush along it on their way.
+        """
+        if not world.leaving:
+            return world
+        steps = list(self.problem.after)
+        here = (k for k, one in enumerate(steps) if any(part is step for part in (one, *parts([one]))))
+        later = steps[next(here, 0) :]
+        retreating = {one.hand for one in parts(later) if isinstance(one, RetreatStep)}
+        for hand in sorted(world.leaving.keys() - retreating):
+            self.become(world, world.pairs - world.leaving_pairs(hand))
+            if self.checker.is_free(q):
+                world = world.left((hand,))
+        return world
+
+    def leaving(self, world: TaskWorld, plan: StepPlan) -> StepPlan:
+        """Return a step in which hands that move leave what they released, and touch it on the first part of it only.
+
+        Args:
+            world: The world before it.
+            plan: The step, in the world of :meth:`parted`.
+
+        Raises:
+            StepFailed: One touches it later, or deeper.
+        """
+        plan = replace(plan, parted=frozenset(world.leaving.keys() - plan.world.leaving.keys()))
+        moving = [hand for hand in sorted(plan.world.leaving) if self._moves(hand, plan.path.states)]
+        if not moving:
+            return plan
+        found = [self._leaves(plan, hand) for hand in moving]
+        left, clearance = max(one for one, _ in found), min(plan.clearance, *(free for _, free in found))
+        return replace(plan, left=left, clearance=clearance, after=plan.after.left(moving))
+
+    def _moves(self, hand: str, states: Array) -> bool:
+        """Whether a hand moves along a path, shape (N, dof)."""
+        moved = {*np.flatnonzero((states != states[0]).any(axis=0)).tolist()}
+        one = self.robot.hands[hand]
+        closing = set() if one.synergy is None else {self.robot.joint_names.index(one.synergy)}
+        return bool(moved & (joints_above(self.robot, one.palm) | closing))
+
     def _retreat(self, world: TaskWorld, step: RetreatStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a hand's way from what it released, which it may touch on the first part of the way only."""
         found = self._line(world, step, q, timing)
-        pairs = world.leaving_pairs(step.hand)
-        if not pairs:
+        if not world.leaving_pairs(step.hand):
             return replace(found, left=0.0)
-        self.become(world, world.pairs - pairs)
-        left, clearance = self._left(found, step, world)
-        self._check_depths(found, left, pairs)
+        left, clearance = self._leaves(found, step.hand)
         return replace(found, left=left, clearance=min(clearance, found.clearance))
 
-    def _left(self, found: StepPlan, step: RetreatStep, world: TaskWorld) -> tuple[float, float]:
-        """Return from where on a retreat is proved without contact, by bisection, and the clearance from there [m].
+    def _leaves(self, plan: StepPlan, hand: str) -> tuple[float, float]:
+        """Return from where on a hand has left what it released for good, and the clearance from there on [m].
+
+        Raises:
+            StepFailed: It has not at the end, or touches it deeper before.
+        """
+        pairs = plan.world.leaving_pairs(hand)
+        self.become(plan.world, plan.world.pairs - pairs)
+        left, clearance = self._left(plan, hand)
+        self._check_depths(plan, left, pairs)
+        return left, clearance
+
+    def _left(self, found: StepPlan, hand: str) -> tuple[float, float]:
+        """Return from where on a step is proved without contact, by bisection, and the clearance from there [m].
 
         Raises:
             StepFailed: It ends in contact.
@@ -379,8 +439,9 @@ class StepPlanner:
         low, high = -1, len(places) - 2 if len(places) > 1 else 0  # from ``high`` on it is proved
         clearance = clearance_from(high)
         if clearance is None:
-            names = " and ".join(world.leaving[step.hand])
-            raise StepFailed(f"it ends in contact with {names}, so a longer retreat is needed")
+            names = " and ".join(found.world.leaving[hand])
+            needed = "a longer retreat" if isinstance(found.step, RetreatStep) else f"a retreat of {hand} before it"
+            raise StepFailed(f"it ends in contact with {names}, so {needed} is needed")
         while high - low > 1:
             middle = (low + high) // 2
             better = clearance_from(middle)

@@ -6,13 +6,14 @@ is planned (:func:`check_steps`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from apex_ompl.constraints.frames import LinkFace, frame_of, holding_hand, holding_link
+from apex_ompl.constraints.links import Links
 from apex_ompl.errors import ApexError, FileFormatError, ParameterError, UnknownNameError
 from apex_ompl.ompl.setup import workspace_goal
 from apex_ompl.planning.line_query import tools_of
@@ -168,8 +169,12 @@ class TaskWorld:
         if isinstance(step, TakingStep):
             return self.grasped(step, q)
         if isinstance(step, RetreatStep):
-            return replace(self, leaving={hand: names for hand, names in self.leaving.items() if hand != step.hand})
+            return self.left((step.hand,))
         return self
+
+    def left(self, hands: Collection[str]) -> TaskWorld:
+        """Return the world in which hands have left what they released."""
+        return replace(self, leaving={hand: names for hand, names in self.leaving.items() if hand not in hands})
 
     def during(self, step: Step, q: Array) -> TaskWorld:
         """Return the world during a step of hands that starts in a state, shape (dof,): with what it takes."""
@@ -245,6 +250,12 @@ def _pair(first: str, second: str) -> Pair:
 def hand_links(robot: Robot, hand: str) -> tuple[str, ...]:
     """Return the links of a hand by name."""
     return robot.hand_of(robot.hands[hand].palm)
+
+
+def joints_above(robot: Robot, link: str) -> set[int]:
+    """Return the planned joints that move a link."""
+    links = Links.of(robot)
+    return {*links.moved(links.point(link, np.zeros(3)).joint)}
 
 
 def check_steps(robot: Robot, problem: Problem) -> None:

@@ -211,10 +211,11 @@ class TaskPlanner:
             StepFailed: It, or one after it, cannot be done.
         """
         unplanned: PlanResult | None = None
-        for choices in self._choices(k, world, q, later, setup):
+        free = self._steps.parted(world, self._stages[k].move, q)
+        for choices in self._choices(k, free, q, later, setup):
             left = list(choices)
             while left and not self._ends():
-                found = self._moved(k, world, q, [one.goal for one in left])
+                found = self._moved(k, free, q, [one.goal for one in left])
                 if not found or found.path is None:
                     unplanned = found
                     title = self._stages[k].move.title if k else "goal"
@@ -223,7 +224,7 @@ class TaskPlanner:
                 reached = found.path.states[-1]
                 chosen = next((one for one in left if np.array_equal(one.goal, reached)), left[0])
                 try:
-                    return self._finished(k, world, found, chosen.later)
+                    return self._finished(k, world, free, found, chosen.later)
                 except StepFailed as failure:
                     self._reject(failure)
                     left = [one for one in left if one is not chosen]
@@ -236,17 +237,31 @@ class TaskPlanner:
             raise StepFailed(f"{move.title}: {unplanned.reason}", f"{move.title}: {unplanned.status}")
         raise StepFailed(WORDS)
 
-    def _finished(self, k: int, world: TaskWorld, found: PlanResult, later: list[Array]) -> list[StepPlan]:
-        """Return the plan of a motion that was found, those of the steps after it, and of all later stages."""
+    def _finished(
+        self, k: int, world: TaskWorld, free: TaskWorld, found: PlanResult, later: list[Array]
+    ) -> list[StepPlan]:
+        """Return the plan of a motion that was found, those of the steps after it, and of all later stages.
+
+        Args:
+            k: Number of the stage.
+            world: The world before its motion.
+            free: The world during it: hands that touch nothing have left what they released.
+            found: The motion.
+            later: Goals that were rehearsed for the stages after it, or none.
+
+        Raises:
+            StepFailed: A step cannot be done.
+        """
         assert found.path is not None
         stage, reached = self._stages[k], found.path.states[-1]
         clearance = found.clearance if found.trajectory is None else found.motion_clearance
         deviation = 0.0 if found.trajectory is None else found.deviation
         move = StepPlan(
-            stage.move, world, world, found.path, found.trajectory, clearance, use=found.limit_use, deviation=deviation
+            stage.move, free, free, found.path, found.trajectory, clearance, use=found.limit_use, deviation=deviation
         )
         with self._interruptible():
-            plans = self._steps.follow(stage.steps, world, reached, self._timing, self._deadline)
+            move = self._steps.leaving(world, move)
+            plans = self._steps.follow(stage.steps, move.after, reached, self._timing, self._deadline)
         last = [move, *plans][-1]
         further = [] if k + 1 == len(self._stages) else self._solved(k + 1, last.after, last.end, later)
         if k == 0:
