@@ -21,8 +21,9 @@ from apex_ompl.paths.path import Path, abreast
 from apex_ompl.planning.line_query import LineQuery, line_query
 from apex_ompl.planning.lines import plan_along
 from apex_ompl.planning.task_constraints import StepConstraints
+from apex_ompl.planning.task_departures import Departures
 from apex_ompl.planning.task_waypoints import LATE, StepFailed, check_near, held_pose, waypoints
-from apex_ompl.planning.task_world import TaskWorld, joints_above
+from apex_ompl.planning.task_world import TaskWorld
 from apex_ompl.robot import Robot
 from apex_ompl.scene.problem import AnyStep, MoveStep, Problem
 from apex_ompl.scene.steps import (
@@ -37,7 +38,6 @@ from apex_ompl.scene.steps import (
     TogetherStep,
     TurnStep,
     WaitStep,
-    parts,
 )
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.combination import superposed
@@ -48,8 +48,6 @@ from apex_ompl.util.clocks import Deadline
 
 BLEND = 0.4  # of the way between two poses of a turn
 HAND_ROOM = 1e-4  # to the limits of a synergy, which motions at another rate need at rests
-DEEPER = 2e-3  # by which contact of a hand with what it leaves may become deeper on the way [m]
-EXAMINED = 50  # states at which that is examined
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +92,8 @@ class StepPlanner:
     Attributes:
         checker: The checker; each step changes its scene.
         problem: The problem.
+        deadline: When what is planned is to be ready.
+        departures: What hands may still touch of what they released.
     """
 
     def __init__(
@@ -102,11 +102,12 @@ class StepPlanner:
         """Plan by ``checker`` until a deadline, or until ``pressed`` holds."""
         self.checker, self.problem = checker, problem
         self._constraints = StepConstraints(checker.robot, problem)
-        self._deadline, self._pressed = deadline, pressed
+        self.deadline, self._pressed = deadline, pressed
+        self.departures = Departures(self)
 
     def ends(self) -> bool:
         """Whether no time is left."""
-        return self._pressed() or self._deadline.expired
+        return self._pressed() or self.deadline.expired
 
     @property
     def robot(self) -> Robot:
@@ -128,7 +129,7 @@ class StepPlanner:
         Raises:
             StepFailed: One cannot be done; the message names it.
         """
-        self._deadline, found = deadline, list[StepPlan]()
+        self.deadline, found = deadline, list[StepPlan]()
         for step in steps:
             try:
                 found.append(self._constrained(self.plan(world, step, q, timing)))
@@ -159,7 +160,7 @@ class StepPlanner:
         if isinstance(step, RetreatStep):
             return self._retreat(world, step, q, timing)
         if isinstance(step, LineStep | TurnStep):
-            return self.leaving(world, self._line(self.parted(world, step, q), step, q, timing))
+            return self.departures.kept(world, self._line(self.departures.parted(world, step, q), step, q, timing))
         if isinstance(step, TogetherStep):
             return self._together(world, step, q, timing)
         if isinstance(step, BodiesStep):
@@ -179,7 +180,7 @@ class StepPlanner:
             StepFailed: It is not free, or not proved in time.
         """
         self.become(world)
-        check = full_check(self.checker, motion, deadline=self._deadline.at)
+        check = full_check(self.checker, motion, deadline=self.deadline.at)
         if check and check.proof is not None:
             return check.proof
         if check.timed_out:
@@ -203,7 +204,7 @@ class StepPlanner:
     def _line(self, world: TaskWorld, step: StraightStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return straight lines from poses of frames to poses, with blends between them."""
         query = self.line_query(world, step, q, timing)
-        found = plan_along(self.checker, query, self._deadline, self.ends)
+        found = plan_along(self.checker, query, self.deadline, self.ends)
         if not found or found.path is None:
             cause = "" if found.end is LineEnd.REACHED else " ".join((f"{found.end}", *found.blocked_by))
             raise StepFailed(found.reason, cause)
@@ -222,7 +223,7 @@ class StepPlanner:
         self, world: TaskWorld, step: HandedStep, q: Array, timing: Timing | None, *, proves: bool = True
     ) -> StepPlan:  # fmt: skip
         """Return a hand that opens or closes, with its proof or without."""
-        before, world = world, self.parted(world, step, q) if isinstance(step, HandStep) else world
+        before, world = world, self.departures.parted(world, step, q) if isinstance(step, HandStep) else world
         during = world.during(step, q)
         end = self.hand_end(during, step, q)
         states = np.stack([q, end]) if (end != q).any() else q[None]
@@ -231,7 +232,7 @@ class StepPlanner:
             plan = self._proved(plan, timing)
         elif timing is not None:
             plan = self._timed(plan, timing, proves=False)
-        return self.leaving(before, plan) if isinstance(step, HandStep) else plan
+        return self.departures.kept(before, plan) if isinstance(step, HandStep) else plan
 
     def hand_end(self, during: TaskWorld, step: HandedStep, q: Array) -> Array:
         """Return the state after a hand has opened or closed, shape (dof,).
@@ -335,7 +336,7 @@ class StepPlanner:
                 return f"the share of a limit that it uses is over 1: {', '.join(over)}"
             if not proves:
                 return ""
-            check = full_check(self.checker, motion, states[0], states[-1:], deadline=self._deadline.at)
+            check = full_check(self.checker, motion, states[0], states[-1:], deadline=self.deadline.at)
             clear.append(nan if check.proof is None else check.proof.clearance)
             return check.reason
 
@@ -358,123 +359,13 @@ class StepPlanner:
         )
         return replace(found, motion=motion)
 
-    def parted(self, world: TaskWorld, step: AnyStep, q: Array) -> TaskWorld:
-        """Return the world of a step in which hands that touch nothing at a state have left what they released.
-
-        Hands that retreat later are left as they are: they may brush along it on their way.
-        """
-        if not world.leaving:
-            return world
-        steps = list(self.problem.after)
-        here = (k for k, one in enumerate(steps) if any(part is step for part in (one, *parts([one]))))
-        later = steps[next(here, 0) :]
-        retreating = {one.hand for one in parts(later) if isinstance(one, RetreatStep)}
-        for hand in sorted(world.leaving.keys() - retreating):
-            self.become(world, world.pairs - world.leaving_pairs(hand))
-            if self.checker.is_free(q):
-                world = world.left((hand,))
-        return world
-
-    def leaving(self, world: TaskWorld, plan: StepPlan) -> StepPlan:
-        """Return a step in which hands that move leave what they released, and touch it on the first part of it only.
-
-        Args:
-            world: The world before it.
-            plan: The step, in the world of :meth:`parted`.
-
-        Raises:
-            StepFailed: One touches it later, or deeper.
-        """
-        plan = replace(plan, parted=frozenset(world.leaving.keys() - plan.world.leaving.keys()))
-        moving = [hand for hand in sorted(plan.world.leaving) if self._moves(hand, plan.path.states)]
-        if not moving:
-            return plan
-        found = [self._leaves(plan, hand) for hand in moving]
-        left, clearance = max(one for one, _ in found), min(plan.clearance, *(free for _, free in found))
-        return replace(plan, left=left, clearance=clearance, after=plan.after.left(moving))
-
-    def _moves(self, hand: str, states: Array) -> bool:
-        """Whether a hand moves along a path, shape (N, dof)."""
-        moved = {*np.flatnonzero((states != states[0]).any(axis=0)).tolist()}
-        one = self.robot.hands[hand]
-        closing = set() if one.synergy is None else {self.robot.joint_names.index(one.synergy)}
-        return bool(moved & (joints_above(self.robot, one.palm) | closing))
-
     def _retreat(self, world: TaskWorld, step: RetreatStep, q: Array, timing: Timing | None) -> StepPlan:
         """Return a hand's way from what it released, which it may touch on the first part of the way only."""
         found = self._line(world, step, q, timing)
         if not world.leaving_pairs(step.hand):
             return replace(found, left=0.0)
-        left, clearance = self._leaves(found, step.hand)
+        left, clearance = self.departures.left(found, step.hand)
         return replace(found, left=left, clearance=min(clearance, found.clearance))
-
-    def _leaves(self, plan: StepPlan, hand: str) -> tuple[float, float]:
-        """Return from where on a hand has left what it released for good, and the clearance from there on [m].
-
-        Raises:
-            StepFailed: It has not at the end, or touches it deeper before.
-        """
-        pairs = plan.world.leaving_pairs(hand)
-        self.become(plan.world, plan.world.pairs - pairs)
-        left, clearance = self._left(plan, hand)
-        self._check_depths(plan, left, pairs)
-        return left, clearance
-
-    def _left(self, found: StepPlan, hand: str) -> tuple[float, float]:
-        """Return from where on a step is proved without contact, by bisection, and the clearance from there [m].
-
-        Raises:
-            StepFailed: It ends in contact.
-        """
-        states, motion = found.path.states, found.motion
-        places: Sequence[float] = range(len(states)) if motion is None else motion.times.tolist()
-
-        def clearance_from(k: int) -> float | None:
-            rest = states[k:] if motion is None else motion.after(places[k]) if places[k] > 0.0 else motion
-            check = full_check(self.checker, rest, deadline=self._deadline.at)
-            if check.timed_out:
-                raise StepFailed(LATE)
-            return None if not check or check.proof is None else check.proof.clearance
-
-        low, high = -1, len(places) - 2 if len(places) > 1 else 0  # from ``high`` on it is proved
-        clearance = clearance_from(high)
-        if clearance is None:
-            names = " and ".join(found.world.leaving[hand])
-            needed = "a longer retreat" if isinstance(found.step, RetreatStep) else f"a retreat of {hand} before it"
-            raise StepFailed(f"it ends in contact with {names}, so {needed} is needed")
-        while high - low > 1:
-            middle = (low + high) // 2
-            better = clearance_from(middle)
-            if better is None:
-                low = middle
-            else:
-                high, clearance = middle, better
-        return float(places[high]), clearance
-
-    def _check_depths(self, plan: StepPlan, left: float, pairs: frozenset[tuple[str, str]]) -> None:
-        """Check that contact with what a hand leaves does not become deeper until it has left it.
-
-        Args:
-            plan: The retreat.
-            left: Where it has left it, a time or a number of states.
-            pairs: What may touch until then.
-
-        Raises:
-            StepFailed: It does.
-        """
-        known, first, states = {frozenset(pair) for pair in pairs}, 0.0, plan.path.states
-        for k, place in enumerate(np.linspace(0.0, left, EXAMINED if left > 0.0 else 1).tolist()):
-            i = min(int(place), len(states) - 1)
-            q = states[i] + (place - i) * (states[min(i + 1, len(states) - 1)] - states[i])
-            q = q if plan.motion is None else plan.motion(place)
-            found = [] if self.checker.is_free(q) else self.checker.contacts(q)
-            found = [c for c in found if frozenset((c.first, c.second)) in known]
-            depth = max((c.depth for c in found), default=0.0)
-            first = depth if k == 0 else first
-            if depth > first + DEEPER:
-                worst = max(found, key=lambda c: c.depth)
-                bodies = f"{worst.first} and {worst.second}"
-                raise StepFailed(f"{bodies} would overlap by {1e3 * depth:.1f} mm on the way", f"overlap {bodies}")
 
 
 def _blend(poses: Sequence[Mapping[str, Array]]) -> float:

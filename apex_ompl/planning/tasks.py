@@ -211,7 +211,7 @@ class TaskPlanner:
             StepFailed: It, or one after it, cannot be done.
         """
         unplanned: PlanResult | None = None
-        free = self._steps.parted(world, self._stages[k].move, q)
+        free = self._steps.departures.parted(world, self._stages[k].move, q)
         for choices in self._choices(k, free, q, later, setup):
             left = list(choices)
             while left and not self._ends():
@@ -260,7 +260,7 @@ class TaskPlanner:
             stage.move, free, free, found.path, found.trajectory, clearance, use=found.limit_use, deviation=deviation
         )
         with self._interruptible():
-            move = self._steps.leaving(world, move)
+            move = self._steps.departures.kept(world, move)
             plans = self._steps.follow(stage.steps, move.after, reached, self._timing, self._deadline)
         last = [move, *plans][-1]
         further = [] if k + 1 == len(self._stages) else self._solved(k + 1, last.after, last.end, later)
