@@ -77,7 +77,7 @@ class PlanResult:
         reason: One sentence that explains a status other than EXACT_SOLUTION.
         problem: The problem.
         robot: Name of the robot; its file is that of the problem.
-        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.model.digest`.
+        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.identity.digest`.
         joint_names: Order of the columns of ``path``.
         held_joints: Names of the joints that were not planned and stayed as at the start.
         planner: Name of the planner.

@@ -16,7 +16,8 @@ from typing import NamedTuple
 from apex_ompl.errors import ApexError, FileFormatError, MissingFileError
 from apex_ompl.model.checkpoint import CONFIG, SHIPPED, checkpoint_folder, read_config
 from apex_ompl.robot import Robot, load_robot
-from apex_ompl.robot.model import digest, robot_names
+from apex_ompl.robot.identity import digest
+from apex_ompl.robot.model import robot_names
 from apex_ompl.util.files import is_file
 
 DEFAULT = "apex"  # checkpoint that ships

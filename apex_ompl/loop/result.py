@@ -91,7 +91,7 @@ class RunResult:
         metrics: Numbers by name: ``time_to_goal`` [s], ``rest_time`` [s], ``stops``, ``replans_asked``,
             ``replans_accepted``, ``clearance`` [m], ``reaction_p95`` [s], ``broken_steps``, ``unguarded_steps``, ...
         settings: Settings of the loop and of the sensor, and the version of the compute-cost table, as JSON.
-        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.model.digest`; empty where it is unknown.
+        robot_digest: Digest of the robot, see :func:`apex_ompl.robot.identity.digest`; empty where it is unknown.
     """
 
     outcome: Outcome

@@ -33,7 +33,8 @@ from apex_ompl.moving.context import RunContext
 from apex_ompl.moving.replanner import Replanner
 from apex_ompl.moving.settings import FOLLOWED, LoopSettings
 from apex_ompl.ompl.process import quiet_ompl, seed_ompl
-from apex_ompl.robot.model import Robot, digest
+from apex_ompl.robot.identity import digest
+from apex_ompl.robot.model import Robot
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at
 from apex_ompl.timing import Trajectory

@@ -28,7 +28,8 @@ from apex_ompl.planning.planner import MotionPlanner
 from apex_ompl.problems.robot_cells import cell_of
 from apex_ompl.problems.robot_problems import robot_of
 from apex_ompl.robot.config import read_config
-from apex_ompl.robot.model import digest, robot_names
+from apex_ompl.robot.identity import digest
+from apex_ompl.robot.model import robot_names
 from apex_ompl.training.generation import Generation, Work, generate
 from apex_ompl.training.units import plan_robot_units, solve_unit
 from apex_ompl.util.extras import import_extra

@@ -27,7 +27,7 @@ from apex_ompl.paths.path import Path
 from apex_ompl.planning.line_query import LineQuery
 from apex_ompl.planning.step_records import certificate
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.identity import digest
 from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.timing.trajectory import ROUNDING, joined
 from apex_ompl.types import Array

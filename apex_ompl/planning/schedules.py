@@ -33,7 +33,7 @@ from apex_ompl.planning.schedule_records import (
 )
 from apex_ompl.planning.step_records import certificate
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.identity import digest
 from apex_ompl.timing import Timing, Trajectory
 from apex_ompl.timing.combination import rest, together, until_rest
 from apex_ompl.timing.trajectory import joined

@@ -12,7 +12,7 @@ from apex_ompl.ompl.setup import PlanningSetup
 from apex_ompl.paths.path import Path
 from apex_ompl.planners import Parameters
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.identity import digest
 from apex_ompl.timing.duration import CALM_FACTOR, DEFAULT_OBJECTIVE
 from apex_ompl.types import Array
 from apex_ompl.util.clocks import Deadline

@@ -34,7 +34,7 @@ from apex_ompl.planning.task_steps import StepPlan, StepPlanner
 from apex_ompl.planning.task_waypoints import StepFailed
 from apex_ompl.planning.task_world import TaskWorld, check_steps
 from apex_ompl.result import PlanResult, PlanStatus
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.identity import digest
 from apex_ompl.robot.rest_to_rest import direct_durations
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Timing

@@ -18,7 +18,7 @@ from apex_ompl.moving.dynamic_obstacles import ScriptedDynamicObstacles
 from apex_ompl.ompl.setup import assemble
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import load_same_robot
+from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.timing.rests import rests
 from apex_ompl.timing.trajectory import Trajectory
 from apex_ompl.types import Array, Indices

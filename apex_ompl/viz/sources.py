@@ -15,7 +15,7 @@ from apex_ompl.loop.result import ARCHIVE, RunResult
 from apex_ompl.planning.task_result import TaskResult, load_result
 from apex_ompl.result import PlanResult
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import load_same_robot
+from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.scripts import is_there, obstacle_at
 from apex_ompl.timing import Trajectory

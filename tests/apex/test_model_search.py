@@ -16,7 +16,8 @@ from apex_ompl.model.checkpoint import CONFIG, SHIPPED
 from apex_ompl.model.proposals import TrajectoryModel
 from apex_ompl.robot import Robot
 from apex_ompl.robot.config import DATA, RobotConfig, read_config
-from apex_ompl.robot.model import build_robot, digest
+from apex_ompl.robot.identity import digest
+from apex_ompl.robot.model import build_robot
 
 FILE = DATA / "dual_panda_softhand.robot.yaml"
 

@@ -7,7 +7,7 @@ import numpy as np
 from apex_ompl.loop.metrics import run_metrics
 from apex_ompl.loop.result import Event, Outcome, RunResult
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.identity import digest
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Goal, Problem
 from apex_ompl.timing import Timing, Trajectory, time_path

@@ -23,7 +23,7 @@ from apex_ompl.onboarding.symmetry import mirror_of
 from apex_ompl.problems.robot_cells import cell_of
 from apex_ompl.problems.robot_problems import drawn_for, problem_of, robot_of
 from apex_ompl.robot import Robot
-from apex_ompl.robot.model import digest
+from apex_ompl.robot.identity import digest
 from apex_ompl.training.store import Store
 
 

@@ -29,7 +29,8 @@ from apex_ompl.collision.cover.spheres import FULL, make_cover, read_covers, rea
 from apex_ompl.collision.cover.survey import proved_share
 from apex_ompl.collision.links import Links
 from apex_ompl.robot.config import RobotConfig, read_config, read_disabled_pairs_file
-from apex_ompl.robot.model import Robot, bare_robot, build_robot, digest, link_of
+from apex_ompl.robot.identity import digest
+from apex_ompl.robot.model import Robot, bare_robot, build_robot, link_of
 from apex_ompl.robot.new import pairs_text
 from apex_ompl.util.files import check_writable, read_text, write_atomically
 from apex_ompl.util.validation import check_integer, check_positive

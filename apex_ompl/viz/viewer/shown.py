@@ -14,7 +14,7 @@ from apex_ompl.ompl.setup import PlanningSetup, assemble
 from apex_ompl.paths.path import resample
 from apex_ompl.planning.task_result import TaskResult
 from apex_ompl.result import PlanResult
-from apex_ompl.robot.model import load_same_robot
+from apex_ompl.robot.identity import load_same_robot
 from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import is_there, obstacle_at
