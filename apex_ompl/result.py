@@ -95,7 +95,7 @@ class PlanResult:
         clearance: Least distance of any checked pair along the whole path, by the exact shapes [m]; infinite without
             any pair, NaN without a proved path. Links that are apart as in a bearing, by a table, do not count.
         clearance_bound: What of ``clearance`` is proved: no state of the path is nearer to contact [m]. It is less by
-            10 um at most, or by half where ``clearance`` is smaller than that.
+            5 % at most, or by 10 um where that is more, but not by more than half.
         clearance_pair: Names of the two bodies that have it.
         proved_by_spheres: Share of the path's length that sphere covers, and tables, proved for all pairs at once.
         checks: Number of states checked one by one; those inside proved stretches of motions do not count.

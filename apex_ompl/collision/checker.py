@@ -179,7 +179,9 @@ class CollisionChecker(SceneBodies):
                 pass
         return first_colliding_sample(path, resolution, start, self.is_free)
 
-    def prove(self, path: Array | Curve, *, tolerance: float = TOLERANCE, deadline: float | None = None) -> PathProof:
+    def prove(
+        self, path: Array | Curve, *, tolerance: float = TOLERANCE, share: float = 0.0, deadline: float | None = None
+    ) -> PathProof:  # fmt: skip
         """Prove that a path is free from its first state to its last, and find its least clearance.
 
         The first state is checked in full, solids inside of others included. Along the rest all pairs are proved to
@@ -189,6 +191,7 @@ class CollisionChecker(SceneBodies):
         Args:
             path: States joined by straight lines, shape (N, dof), or a curve.
             tolerance: Tolerance of the least clearance [m]; 0 asks for the proof alone, which is faster.
+            share: The same as a share of the clearance; the larger one counts.
             deadline: Value of ``time.perf_counter`` at which the proof is abandoned [s].
 
         Raises:
@@ -202,7 +205,7 @@ class CollisionChecker(SceneBodies):
         if not self.is_free(start):
             contacts = self.contacts(start) if np.isfinite(start).all() else []
             return PathProof.refused(str(contacts[0]) if contacts else "in collision", path)
-        return self._prover.prove(self.kernel, path, tolerance=tolerance, deadline=deadline)
+        return self._prover.prove(self.kernel, path, tolerance=tolerance, share=share, deadline=deadline)
 
     def obstacle_distance(self, path: Array) -> float:
         """Return the least distance of robot and held objects to obstacles along a path, 0 where they touch [m].

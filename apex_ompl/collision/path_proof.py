@@ -208,7 +208,7 @@ class PathProver:
             return shapes
 
     def prove(
-        self, kernel: Kernel, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE,
+        self, kernel: Kernel, curve: Curve, *, touch: float = TOUCH, tolerance: float = TOLERANCE, share: float = 0.0,
         deadline: float | None = None,
     ) -> PathProof:  # fmt: skip
         """Prove that a curve is free, and find its least clearance.
@@ -219,6 +219,7 @@ class PathProver:
             touch: Distance of a pair that counts as contact [m].
             tolerance: Of the least clearance [m]: ``clearance_bound`` is at least ``clearance`` less this, or half of
                 it; 0 asks for the proof alone.
+            share: The same as a share of the clearance; the larger one counts.
             deadline: Value of ``time.perf_counter`` at which to give up [s].
         """
         if not (np.isfinite(curve.states).all() and np.isfinite(curve.rates).all()):
@@ -227,7 +228,7 @@ class PathProver:
         if tolerance > 0.0:
             places = distinct(np.linspace(0, len(curve.states) - 1, SEEDS).round().astype(int))
             limits = _limits(np.nanmin(kernel.clearance(curve.states[places], MOST_LIMIT), initial=MOST_LIMIT))
-        proof, outcome, over = self._run(kernel, curve, limits, (touch, tolerance), deadline)
+        proof, outcome, over = self._run(kernel, curve, limits, (touch, tolerance, share), deadline)
         margin, least, where, by_spheres = proof.figures
         names, ok = self._names(kernel, *proof.pair), outcome == PROVED
         reason, length = "", float(curve.knots[-1] - curve.knots[0])
@@ -254,12 +255,12 @@ class PathProver:
         near = np.nan_to_num(kernel.clearance(states, MOST_LIMIT).min(axis=1), nan=MOST_LIMIT)
         for k, q in enumerate(states):
             curve = Curve(np.zeros(2), np.stack([q, q]), still, 0.0)
-            proof, _, _ = self._run(kernel, curve, _limits(float(near[k])), (TOUCH, TOLERANCE))
+            proof, _, _ = self._run(kernel, curve, _limits(float(near[k])), (TOUCH, TOLERANCE, 0.0))
             found[k] = proof.figures.least
         return found
 
     def _run(
-        self, kernel: Kernel, curve: Curve, limits: Iterable[float], bounds: tuple[float, float],
+        self, kernel: Kernel, curve: Curve, limits: Iterable[float], bounds: tuple[float, float, float],
         deadline: float | None = None,
     ) -> tuple[CurveProof, int, bool]:  # fmt: skip
         """Return a proof at its end, its outcome, and whether the deadline passed before.
@@ -268,7 +269,7 @@ class PathProver:
             kernel: The kernel.
             curve: The curve.
             limits: Clearances above which none is looked for, in turn, until one is found [m].
-            bounds: Distance that counts as contact, and tolerance of the clearance [m].
+            bounds: Distance that counts as contact, tolerance of the clearance [m], and the same as a share of it.
             deadline: As of :meth:`prove`.
         """
         proof, shapes = self._proof(kernel), self._shapes(kernel)

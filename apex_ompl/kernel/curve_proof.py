@@ -83,15 +83,16 @@ class CurveProof:
         p.worst[:] = -1
         p.figures[:] = limit, np.inf, curve.knots[0], 0.0
 
-    def advance(self, touch: float, tolerance: float, budget: int) -> int:
+    def advance(self, touch: float, tolerance: float, share: float, budget: int) -> int:
         """Go on with the proof; return MORE where it is not at its end, else PROVED, TOUCHING, OUTSIDE or another.
 
         Args:
             touch: Distance of a pair that counts as contact [m].
             tolerance: Tolerance of the least clearance [m]; 0 asks for the proof alone.
+            share: The same as a share of the clearance; the larger one counts.
             budget: Most intervals to look at.
         """
-        return int(curve_proof.prove_curve(*self._arrays, touch, tolerance, budget))
+        return int(curve_proof.prove_curve(*self._arrays, touch, tolerance, share, budget))
 
     @property
     def figures(self) -> ProofFigures:

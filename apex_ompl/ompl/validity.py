@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from apex_ompl.constraints.constraint_set import ConstraintSet
     from apex_ompl.constraints.proof import ConstraintCertificate
 
+CLEARANCE_SHARE = 0.05  # of the clearance: tolerance of the one that is reported
 JUMP = 2.0  # largest distance of neighboring states of a motion on constraints, in units of that on the straight line
 
 
@@ -325,7 +326,7 @@ def full_check(
     curve = Curve.polyline(states)
     if motion is not None:
         curve = Curve.cubic(motion.times, states, motion.velocities, motion.accelerations)
-    proof = checker.prove(curve, deadline=deadline)
+    proof = checker.prove(curve, share=CLEARANCE_SHARE, deadline=deadline)
     if proof:
         return FullCheck(True, "", None, proof, constraints=kept)
     if proof.timed_out:

@@ -75,6 +75,11 @@ def test_clearance_of_a_path_holds_at_dense_states(grazing: ModuleType, robot: R
             least = min(distances.nearest(q)[0] for q in dense)
             assert proof.clearance_bound <= least + 1e-7
             assert proof.clearance_bound >= proof.clearance - TOLERANCE
+            for share in (0.05, 0.3):
+                rough = checker.prove(path, share=share)
+                assert rough.intervals <= proof.intervals
+                assert rough.clearance_bound <= proof.clearance <= rough.clearance + 1e-9
+                assert rough.clearance_bound >= rough.clearance - max(TOLERANCE, share * rough.clearance) - 1e-9
             at = Curve.polyline(path)
             state = np.array([np.interp(proof.parameter, at.knots, column) for column in at.states.T])
             there = distances(state, distances.scene.pairs)

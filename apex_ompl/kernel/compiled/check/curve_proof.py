@@ -71,12 +71,15 @@ def _append(p: ProofBuffers, a: float, b: float, first: int, second: int) -> Non
 
 
 @inlined
-def _record(p: ProofBuffers, distance: float, where: float, a: int, b: int, tolerance: float) -> None:
-    """Keep the least distance found, and lower the margin to it less the tolerance, at most by half."""
+def _record(
+    p: ProofBuffers, distance: float, where: float, a: int, b: int, tolerance: float, share: float
+) -> None:  # fmt: skip
+    """Keep the least distance found, and lower the margin to it less the larger tolerance, at most by half."""
     if distance < p.figures[LEAST]:
         p.figures[LEAST], p.figures[WHERE], p.worst[0], p.worst[1] = distance, where, a, b
         if tolerance > 0.0:
-            p.figures[MARGIN] = min(p.figures[MARGIN], max(distance - tolerance, 0.5 * distance))
+            least = distance - max(tolerance, share * distance)
+            p.figures[MARGIN] = min(p.figures[MARGIN], max(least, 0.5 * distance))
 
 
 @inlined
@@ -173,7 +176,7 @@ def _left_by_tables(t: RobotArrays, w: Workspace, p: ProofBuffers, count: int) -
 @inlined
 def _by_shapes(
     t: RobotArrays, w: Workspace, h: ShapeArrays, rows: Integers, g: PairBuffers, p: ProofBuffers,
-    a: float, b: float, count: int, shortest: float, touch: float, tolerance: float,
+    a: float, b: float, count: int, shortest: float, touch: float, tolerance: float, share: float,
 ) -> int:  # fmt: skip
     """Bound the pairs in ``found`` by their shapes; append both halves of the interval for those that stay open.
 
@@ -191,7 +194,7 @@ def _by_shapes(
             continue
         _place_parts(t, w, p.state, x, y)
         bound, upper = _bound(f, h, rows, g, x, y, p.figures[MARGIN])
-        _record(p, upper, middle, x, y, tolerance)
+        _record(p, upper, middle, x, y, tolerance, share)
         if upper <= touch:
             return TOUCHING
         if bound > 0.0 and bound >= p.figures[MARGIN]:
@@ -207,14 +210,16 @@ def _by_shapes(
 def prove_curve(
     ri: Integers, rf: Floats, si: Integers, sf: Floats, sg: Singles, hi: Integers, hf: Floats, rows: Integers,
     wi: Integers, wf: Floats, gi: Integers, gf: Floats, pi: Integers, pf: Floats,
-    knots: Floats, states: Floats, rates: Floats, slack: float, touch: float, tolerance: float, budget: int,
+    knots: Floats, states: Floats, rates: Floats, slack: float, touch: float, tolerance: float, share: float,
+    budget: int,
 ) -> int:  # fmt: skip
     """Prove a curve free, for at most ``budget`` intervals; another call goes on.
 
     Robot, scene and shapes come packed; ``rows`` gives the shape of an obstacle by its number. Then come the buffers of
     a state, of a pair and of the proof, in which the whole curve is the first interval. ``knots``, ``states``,
     ``rates`` and ``slack`` are the curve, see :func:`.curve.set_motion`; ``touch`` is the distance that counts as
-    contact [m], ``tolerance`` that of the least clearance [m], 0 for a bare proof.
+    contact [m], ``tolerance`` that of the least clearance [m], 0 for a bare proof, and ``share`` the same as a share of
+    it; the larger one counts.
 
     Returns:
         PROVED, MORE, TOUCHING (the pair is in ``worst``), UNDECIDED where an
@@ -243,7 +248,7 @@ def prove_curve(
                 return UNDECIDED
         if len(t.table_joints):
             count = _left_by_tables(t, w, p, count)
-        outcome = _by_shapes(t, w, h, rows, g, p, a, b, count, shortest, touch, tolerance)
+        outcome = _by_shapes(t, w, h, rows, g, p, a, b, count, shortest, touch, tolerance, share)
         if outcome != PROVED:
             return outcome
     return PROVED if p.places[0] == p.places[1] else MORE
