@@ -28,7 +28,7 @@ from apex_ompl.paths import Optimizer, Spline
 from apex_ompl.problems import witness, worlds
 from apex_ompl.robot import Robot
 from apex_ompl.robot.config import RobotConfig
-from apex_ompl.robot.model import _spelled
+from apex_ompl.robot.identity import _spelled
 from apex_ompl.scene import AttachedObject, Goal
 from apex_ompl.scene.bodies import Body
 from apex_ompl.training import Paths
