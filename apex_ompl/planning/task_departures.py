@@ -72,7 +72,7 @@ class Departures:
         return bool(moved & (joints_above(self._planner.robot, one.palm) | closing))
 
     def left(self, plan: StepPlan, hand: str) -> tuple[float, float]:
-        """Return from where on a hand has left what it released for good, and the clearance from there on [m].
+        """Return from where on a hand has left what it released for good, and the clearance after that [m].
 
         Raises:
             StepFailed: It has not at the end, or touches it deeper before.
