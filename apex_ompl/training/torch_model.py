@@ -284,7 +284,7 @@ def _gain_lines(told: Mapping[str, Any]) -> list[str]:
     low, high = told["interval"]
     stages = ", ".join(f"{stage} {count}" for stage, count in told["stages"].items()) or "none"
     return [
-        f"## {told['verdict'].capitalize()}", "",
+        f"## {told['verdict'][0].upper()}{told['verdict'][1:]}", "",
         f"{told['problems']} validation problems whose straight line is not free, each planned by `apex` with this "
         f"model and with random perturbations in its place, at most {told['timeout']:g} s, untimed:", "",
         "| | with the model | without |", "|---|---:|---:|",

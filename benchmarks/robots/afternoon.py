@@ -1,7 +1,8 @@
 """A robot in an afternoon: from the URDF of a package to a trained planner, by the documented commands alone.
 
 ``apex-ompl robot new``, ``check``, ``prepare`` and ``train`` are run with the options that docs/robots.md has, in a
-folder of their own, and timed by the wall clock; a stage that is done is not run again. Then test problems (the first
+folder of their own, and timed by the wall clock; a stage that is done is not run again. A ``note`` on how it went, by
+hand in ``stages.json``, is shown. Then test problems (the first
 ones of :mod:`benchmarks.robots.any_robot`, on which nothing was tuned or trained) are planned by apex with the trained
 model, by apex without one, and by rrtconnect+polish, with the same checker, problems, seeds and time limit. Times are
 CPU times of whole calls without timing; the share solved in 1 s and the percentiles are over problems that any of the
@@ -101,7 +102,11 @@ def tables(known: dict[str, Any], told: dict[str, Any], runs: list[dict[str, Any
     """Return the figures and their tables."""
     lines = [record.row(["stage", "wall s"]), record.row(["---", "---:"])]
     lines += [record.row([stage, f"{seconds:.0f}"]) for stage, seconds in known["seconds"].items()]
-    lines += [record.row(["all", f"{sum(known['seconds'].values()):.0f}"]), ""]
+    lines += [
+        record.row(["all", f"{sum(known['seconds'].values()):.0f}"]),
+        *(["", known["note"]] if known.get("note") else []),
+        "",
+    ]
     done, checked = told["done"], told["done"]["validation"]
     lines += [
         f"{done['data']['paths']} paths of {done['data']['solved']} problems were generated in "
