@@ -36,19 +36,8 @@ from apex_ompl.util.cache import kept, weakly_cached
 CONVEX_TOLERANCE = 1e-7  # a mesh is its hull when its triangles' centers are no deeper than this below it [m]
 MANY = 4000  # triangles
 LARGE_HULL = 24  # corners, from which a search by neighbors is faster than one of all
-# Fields with a row for each shape.
-OF_EACH = (
-    "kind",
-    "joint",
-    "points_of",
-    "root",
-    "graph",
-    "rotation",
-    "offset",
-    "size",
-    "ball",
-    "depth",
-)  # with a row each
+OF_EACH = "kind", "joint", "points_of", "root", "graph", "rotation", "offset", "size", "ball", "depth"
+"""Fields of the arrays that have a row for each shape."""
 
 MOST_MESHES = 256  # that are kept
 

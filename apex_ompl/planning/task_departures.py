@@ -12,7 +12,7 @@ from apex_ompl.ompl.validity import full_check
 from apex_ompl.planning.task_waypoints import LATE, StepFailed
 from apex_ompl.planning.task_world import TaskWorld, joints_above
 from apex_ompl.scene.problem import AnyStep
-from apex_ompl.scene.steps import RetreatStep, parts
+from apex_ompl.scene.steps import GraspStep, ReleaseStep, RetreatStep, parts
 from apex_ompl.types import Array
 
 if TYPE_CHECKING:
@@ -49,6 +49,8 @@ class Departures:
     def kept(self, world: TaskWorld, plan: StepPlan) -> StepPlan:
         """Return a step in which hands that move leave what they released, and touch it on the first part of it only.
 
+        While a hand takes or lets go of something else, contact does not become deeper.
+
         Args:
             world: The world before it.
             plan: The step, in the world of :meth:`parted`.
@@ -58,6 +60,11 @@ class Departures:
         """
         plan = replace(plan, parted=frozenset(world.leaving.keys() - plan.world.leaving.keys()))
         moving = [hand for hand in sorted(plan.world.leaving) if self._moves(hand, plan.path.states)]
+        if isinstance(plan.step, GraspStep | ReleaseStep):  # after which the hand goes on leaving
+            end = float(len(plan.path.states) - 1) if plan.motion is None else plan.motion.duration
+            for hand in moving:
+                self._check_depths(plan, hand, end)
+            return plan
         if not moving:
             return plan
         found = [self.left(plan, hand) for hand in moving]
@@ -77,10 +84,9 @@ class Departures:
         Raises:
             StepFailed: It has not at the end, or touches it deeper before.
         """
-        pairs = plan.world.leaving_pairs(hand)
-        self._planner.become(plan.world, plan.world.pairs - pairs)
+        self._planner.become(plan.world, plan.world.pairs - plan.world.leaving_pairs(hand))
         left, clearance = self._free_from(plan, hand)
-        self._check_depths(plan, left, pairs)
+        self._check_depths(plan, hand, left)
         return left, clearance
 
     def _free_from(self, found: StepPlan, hand: str) -> tuple[float, float]:
@@ -114,17 +120,19 @@ class Departures:
                 high, clearance = middle, better
         return float(places[high]), clearance
 
-    def _check_depths(self, plan: StepPlan, left: float, pairs: frozenset[tuple[str, str]]) -> None:
+    def _check_depths(self, plan: StepPlan, hand: str, left: float) -> None:
         """Check that contact with what a hand leaves does not become deeper until it has left it.
 
         Args:
             plan: The step.
+            hand: The hand.
             left: Where it has left it, a time or a number of states.
-            pairs: What may touch until then.
 
         Raises:
             StepFailed: It does.
         """
+        pairs = plan.world.leaving_pairs(hand)
+        self._planner.become(plan.world, plan.world.pairs - pairs)
         known, first, states = {frozenset(pair) for pair in pairs}, 0.0, plan.path.states
         for k, place in enumerate(np.linspace(0.0, left, EXAMINED if left > 0.0 else 1).tolist()):
             i = min(int(place), len(states) - 1)

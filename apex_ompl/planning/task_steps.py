@@ -31,7 +31,6 @@ from apex_ompl.scene.steps import (
     DetachStep,
     GraspStep,
     HandedStep,
-    HandStep,
     LineStep,
     RetreatStep,
     StraightStep,
@@ -223,7 +222,7 @@ class StepPlanner:
         self, world: TaskWorld, step: HandedStep, q: Array, timing: Timing | None, *, proves: bool = True
     ) -> StepPlan:  # fmt: skip
         """Return a hand that opens or closes, with its proof or without."""
-        before, world = world, self.departures.parted(world, step, q) if isinstance(step, HandStep) else world
+        before, world = world, self.departures.parted(world, step, q)
         during = world.during(step, q)
         end = self.hand_end(during, step, q)
         states = np.stack([q, end]) if (end != q).any() else q[None]
@@ -232,7 +231,7 @@ class StepPlanner:
             plan = self._proved(plan, timing)
         elif timing is not None:
             plan = self._timed(plan, timing, proves=False)
-        return self.departures.kept(before, plan) if isinstance(step, HandStep) else plan
+        return self.departures.kept(before, plan)
 
     def hand_end(self, during: TaskWorld, step: HandedStep, q: Array) -> Array:
         """Return the state after a hand has opened or closed, shape (dof,).
