@@ -2,11 +2,9 @@
 
 ``apex-ompl robot new``, ``check``, ``prepare`` and ``train`` are run with the options that docs/robots.md has, in a
 folder of their own, and timed by the wall clock; a stage that is done is not run again. A ``note`` on how it went, by
-hand in ``stages.json``, is shown. Then test problems (the first
-ones of :mod:`benchmarks.robots.any_robot`, on which nothing was tuned or trained) are planned by apex with the trained
-model, by apex without one, and by rrtconnect+polish, with the same checker, problems, seeds and time limit. Times are
-CPU times of whole calls without timing; the share solved in 1 s and the percentiles are over problems that any of the
-three solves.
+hand in ``stages.json``, is shown. Then test problems, on which nothing was tuned or trained, are planned by apex with
+the trained model, by apex without one, and by rrtconnect+polish; problems, times and columns are those of
+:mod:`benchmarks.robots.any_robot`, the time limit is shorter.
 
 Usage: python -m benchmarks.robots.afternoon [ROBOT] [-n 100] [--hours 2] [--jobs 2] [--folder FOLDER]
 """
@@ -17,12 +15,10 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from apex_ompl import MotionPlanner
 from apex_ompl.robot import load_robot
 from apex_ompl.util.entry_point import run_script
 from apex_ompl.util.files import write_atomically
@@ -31,14 +27,19 @@ from apex_ompl.util.validation import check_name
 from benchmarks.lib import record
 from benchmarks.robots.any_robot import FIRST
 from benchmarks.robots.boxes import Boxes
-from benchmarks.robots.figures import SOON, cpu
+from benchmarks.robots.figures import PLANNERS, Figures, Rows
 from benchmarks.robots.fleet import CELLS, PACKAGE
 
-DEPENDS = ("@planning", "apex_ompl/onboarding", "apex_ompl/training", "benchmarks/robots/boxes.py")
+DEPENDS = (
+    "@planning", "apex_ompl/onboarding", "apex_ompl/training", "benchmarks/robots/boxes.py",
+    "benchmarks/robots/figures.py",
+)  # fmt: skip
 FOLDER = Path(__file__).parents[1] / "runs" / "afternoon"
 TIMEOUT = 2.0  # of a plan, by the wall clock [s]
-MODEL = "apex"
-ROWS = {MODEL: ("apex", {}), "apex without the model": ("apex", {"model": "none"}), "rrtconnect+polish": (None, {})}
+ROWS: Rows = {
+    "apex with the model": ("apex", {}), "apex without a model": PLANNERS["apex"],
+    "rrtconnect+polish": PLANNERS["rrtconnect+polish"],
+}  # fmt: skip
 
 
 def commands(name: str, file: Path, hours: float, jobs: int) -> dict[str, list[str]]:
@@ -74,31 +75,9 @@ def made(name: str, folder: Path, hours: float, jobs: int) -> tuple[Path, dict[s
     return file, known
 
 
-def planned(file: Path, count: int) -> list[dict[str, Any]]:
-    """Plan the test problems that are missing, and return the runs of all."""
-    notes = file.parent / "runs.json"
-    found: dict[str, Any] = read_json(notes, "runs") if notes.exists() else {}
-    boxes, planner = Boxes(load_robot(file), str(file)), MotionPlanner(str(file))
-    names = [str(k) for k in range(FIRST, FIRST + count)]
-    missing = [name for name in names if name not in found]
-    for k, name in enumerate([*missing[:1], *missing]):  # the first one twice: what a process does once
-        problem, row = boxes.problem(int(name)), {}
-        for label, (method, params) in ROWS.items():
-            planner.world.clear()
-            began = cpu()
-            plan = planner.plan_problem(
-                problem, method or label, params=params, timeout=TIMEOUT, timing=False, seed=int(name)
-            )
-            used = cpu() - began
-            row[label] = {"solved": bool(plan), "cpu_s": used, "by": plan.solved_by}
-            row[label] |= {"length": plan.length if plan else None}
-        if k:
-            found[name] = row
-            write_atomically(notes, (json.dumps(found, indent=1) + "\n").encode())
-    return [found[name] for name in names]
-
-
-def tables(known: dict[str, Any], told: dict[str, Any], runs: list[dict[str, Any]]) -> tuple[dict[str, Any], str]:
+def tables(
+    known: dict[str, Any], told: dict[str, Any], mine: Figures, names: Iterable[str]
+) -> tuple[dict[str, Any], str]:
     """Return the figures and their tables."""
     lines = [record.row(["stage", "wall s"]), record.row(["---", "---:"])]
     lines += [record.row([stage, f"{seconds:.0f}"]) for stage, seconds in known["seconds"].items()]
@@ -114,30 +93,14 @@ def tables(known: dict[str, Any], told: dict[str, Any], runs: list[dict[str, Any
         f"{told['spent']['training'] / 60:.0f} min. Validation, {checked['problems']} problems: {checked['verdict']} "
         f"(ratio of CPU times {checked['ratio']:.2f}, 95 % {checked['interval'][0]:.2f} to "
         f"{checked['interval'][1]:.2f}; solved {checked['solved'][0]} with the model, {checked['solved'][1]} without).",
-        "", record.row(["test problems", "N", "solved", "in 1 s, %", "CPU s p50", "p95", "length rad", "found by"]),
-        record.row(["---", *["---:"] * 6, "---"]),
+        "", record.row(["test problems", "N", "unsolved by all", "in 1 s", "CPU s p50", "p95", "length rad"]),
+        record.row(["---", *["---:"] * 6]),
     ]  # fmt: skip
-    counted = [run for run in runs if any(one["solved"] for one in run.values())]
-    both = [run for run in counted if all(one["solved"] for one in run.values())]
-    figures: dict[str, Any] = {"stages": known["seconds"], "training": told["done"], "rows": {}}
-    for label in ROWS:
-        mine = [run[label] for run in counted]
-        times = [one["cpu_s"] if one["solved"] else np.inf for one in mine]
-        soon = 100.0 * float(np.mean(np.array(times) <= SOON)) if times else float("nan")
-        by = [one["by"] for one in mine if one["solved"]]
-        often = sorted(set(by), key=lambda stage: -by.count(stage))
-        quantiles = [record.reached(times, p) for p in (50, 95)]
-        length = float(np.median([run[label]["length"] for run in both])) if both else float("nan")
-        figures["rows"][label] = {
-            "n": len(mine),
-            "solved": len(by),
-            "soon": soon,
-            "p50_s": quantiles[0],
-            "p95_s": quantiles[1],
-        }
-        cells = ["-" if value is None else f"{value:.3f}" for value in quantiles]
-        stages = ", ".join(f"{stage} {by.count(stage)}" for stage in often)
-        lines.append(record.row([label, len(mine), len(by), f"{soon:.1f}", *cells, f"{length:.2f}", stages]))
+    count, unsolved, outcomes = mine.outcomes(names)
+    for label, one in outcomes.items():
+        cells = ["-" if value is None else f"{value:.3f}" for value in one.values()]
+        lines.append(record.row([label, count, unsolved, *cells]))
+    figures = {"stages": known["seconds"], "training": done, "rows": outcomes}
     return figures, "\n".join(lines)
 
 
@@ -152,10 +115,13 @@ def main() -> None:
     name = check_name(args.robot, "robot", CELLS)
     file, known = made(name, args.folder.resolve() / name, args.hours, args.jobs)
     told = read_json(file.parent / f"{name}.training" / "session.json", "training")
-    figures, table = tables(known, told, planned(file, args.n))
+    mine, names = Figures(file, ROWS, TIMEOUT), [str(k) for k in range(FIRST, FIRST + args.n)]
+    boxes = Boxes(load_robot(file), str(file))
+    mine.run(names, lambda name: boxes.problem(int(name)))
+    figures, table = tables(known, told, mine, names)
     record.write(
         f"afternoon_{name}", figures, table, n=args.n, hours=args.hours, jobs=args.jobs, limit=f"{TIMEOUT:g} s",
-        stages_commit=known["commit"],
+        stages_commit=known["commit"], run_commits="; ".join(mine.data["commits"]),
     )  # fmt: skip
 
 

@@ -24,7 +24,9 @@ from apex_ompl.util.files import write_atomically
 from apex_ompl.util.schema import read_json
 from benchmarks.lib import record
 
-PLANNERS = {"apex": {"model": "none"}, "rrtconnect+polish": {}}
+Rows = Mapping[str, tuple[str, Mapping[str, Any]]]
+"""Label -> planner and its parameters."""
+PLANNERS: Rows = {"apex": ("apex", {"model": "none"}), "rrtconnect+polish": ("rrtconnect+polish", {})}
 TIMEOUT = 10.0  # of a call, by the wall clock of a machine that does other things too [s]
 SOON = 1.0  # [s]
 SAMPLES, SEED = 2000, 7  # states of the shares
@@ -40,9 +42,9 @@ def cpu() -> float:
 class Figures:
     """Figures of one robot, in a file."""
 
-    def __init__(self, robot: Path) -> None:
-        """Read what there is beside a robot file."""
-        self.robot, self.file = robot, robot.parent / "figures.json"
+    def __init__(self, robot: Path, rows: Rows = PLANNERS, timeout: float = TIMEOUT) -> None:
+        """Read what there is beside a robot file; ``rows`` are planned with a time limit [s]."""
+        self.robot, self.file, self.rows, self.timeout = robot, robot.parent / "figures.json", rows, timeout
         self.data: dict[str, Any] = read_json(self.file, "figures of a robot") if self.file.exists() else {"runs": {}}
 
     def write(self, **figures: Any) -> None:
@@ -82,37 +84,43 @@ class Figures:
             return
         self.note_commit()
         planner = MotionPlanner(str(self.robot))
-        for one, params in PLANNERS.items():  # what a process does once
-            planner.plan_problem(problem(missing[0]), one, params=params, timeout=TIMEOUT, timing=False, seed=1)
+        for one, params in self.rows.values():  # what a process does once
+            planner.plan_problem(problem(missing[0]), one, params=params, timeout=self.timeout, timing=False, seed=1)
         for k, name in enumerate(missing):
             given, row = problem(name), {}
-            for one, params in PLANNERS.items():
+            for label, (one, params) in self.rows.items():
                 planner.world.clear()
                 began = cpu()
-                found = planner.plan_problem(given, one, params=params, timeout=TIMEOUT, timing=False, seed=k)
+                found = planner.plan_problem(given, one, params=params, timeout=self.timeout, timing=False, seed=k)
                 used, length = cpu() - began, found.length if found else None
-                row[one] = {"solved": bool(found), "cpu_s": used, "length": length, "by": found.solved_by}
+                row[label] = {"solved": bool(found), "cpu_s": used, "length": length, "by": found.solved_by}
             self.data["runs"][name] = row
             self.write()
             print(name, *(f"{one} {r['cpu_s']:.2f} s by {r['by'] or '-'}" for one, r in row.items()), flush=True)
 
-    def row(self, label: str, names: Iterable[str]) -> tuple[dict[str, Any], list[Any]]:
-        """Return the figures of the problems of some names, and a row of the table."""
-        data = self.data
-        figures = {key: data[key] for key in ("dof", "pairs", "free", "proved", "spoilers", "prepare_cpu_s")}
-        all_runs = [data["runs"][name] for name in names if name in data["runs"]]
+    def outcomes(self, names: Iterable[str]) -> tuple[int, int, dict[str, dict[str, float | None]]]:
+        """Return the number of problems that any row solves, that of the others, and the figures of each row."""
+        all_runs = [self.data["runs"][name] for name in names if name in self.data["runs"]]
         runs = [run for run in all_runs if any(one["solved"] for one in run.values())]
         both = [run for run in runs if all(one["solved"] for one in run.values())]
-        cells: list[Any] = [label, data["dof"], data["pairs"], f"{data['free']:.0%}", f"**{data['proved']:.0%}**"]
-        cells += [f"{data['prepare_cpu_s']:.0f}", len(runs), len(all_runs) - len(runs)]
-        figures |= {"robot": label, "n": len(runs), "unsolved": len(all_runs) - len(runs)}
-        for one in PLANNERS:
-            mine = [run[one] for run in runs]
+        found = dict[str, dict[str, float | None]]()
+        for label in self.rows:
+            mine = [run[label] for run in runs]
             soon = float(np.mean([run["solved"] and run["cpu_s"] <= SOON for run in mine])) if mine else None
-            times = [_percentile(mine, p) for p in (50, 95)]
-            length = float(np.median([run[one]["length"] for run in both])) if both else None
-            figures[one] = {"soon": soon, "p50_s": times[0], "p95_s": times[1], "length_rad": length}
-            cells += ["-" if value is None else f"{value:.2f}" for value in (soon, *times, length)]
+            p50, p95 = (_percentile(mine, p) for p in (50, 95))
+            length = float(np.median([run[label]["length"] for run in both])) if both else None
+            found[label] = {"soon": soon, "p50_s": p50, "p95_s": p95, "length_rad": length}
+        return len(runs), len(all_runs) - len(runs), found
+
+    def row(self, label: str, names: Iterable[str]) -> tuple[dict[str, Any], list[Any]]:
+        """Return the figures of the problems of some names, and a row of the table."""
+        data, (count, unsolved, outcomes) = self.data, self.outcomes(names)
+        figures = {key: data[key] for key in ("dof", "pairs", "free", "proved", "spoilers", "prepare_cpu_s")}
+        cells: list[Any] = [label, data["dof"], data["pairs"], f"{data['free']:.0%}", f"**{data['proved']:.0%}**"]
+        cells += [f"{data['prepare_cpu_s']:.0f}", count, unsolved]
+        figures |= {"robot": label, "n": count, "unsolved": unsolved} | outcomes
+        for one in outcomes.values():
+            cells += ["-" if value is None else f"{value:.2f}" for value in one.values()]
         cells.append(", ".join(f"{pair} {share:.0%}" for pair, share in data["spoilers"].items()))
         return figures, cells
 
