@@ -3,8 +3,8 @@
 This is the paper's experiment with obstacles that "are imposed manually": one is brought in while the robots move, and
 stays until it is moved again. Distances, speeds and times are this project's own choice. The cube comes into view
 beside the way, moves at constant speed to where a hand will be, and stands; the first motion is clear of it until half
-a second after that, so that a robot that stops for what it sees is not hit. A cube of ``popup`` comes into being at
-once, nearer to the hand, and moves on for ever if it moves.
+a second after that, and all of its way is 0.12 m from the robot when it sets out, so that a robot that stops for what
+it sees is not hit. A cube of ``popup`` comes into being at once, nearer to the hand, and moves on for ever if it moves.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from apex_ompl.problems.world_ambushes import (
     CLEARANCE,
-    DRAWS,
     GOAL_CLEARANCE,
     SPEEDS,
     AmbushEnvironment,
@@ -28,13 +27,15 @@ from apex_ompl.scene.scripts import place_at, row_of
 from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
+DRAWS = 1000  # of a cube
+NEXT = 200  # places to which one that is moved again may go that are looked at
 SHARES = (0.05, 0.4)  # of the first motion's length, at which the cube comes into view
 COMING = (0.3, 1.0)  # for which it comes [s]
 NOTICE = 0.5  # after it stands, or after it comes into view where no draw leaves that, before the motion meets it [s]
 AGAIN_SHARE = 0.5  # of the cubes that are moved once more
 STANDS = (2.0, 5.0)  # before it is moved again [s]
 WAYS = (0.2, 0.5)  # that it is moved then [m]
-APART = 0.12  # of that way to the robot when it begins [m]
+APART = 0.12  # of each of its ways to the robot when the cube sets out [m]
 STEP, MOMENT = 0.02, 0.02  # between two places and between two times that are looked at [m, s]
 
 
@@ -59,6 +60,7 @@ class ImposedEnvironment(AmbushEnvironment):
         super().__init__(name, problem, edge, rng, float(rng.uniform(*SPEEDS)))
         again = rng.random() < AGAIN_SHARE
         self._waits = float(rng.uniform(*STANDS)) if again else math.inf
+        self._coming: _Coming | None = None
         self._moved_again = math.inf
 
     def start(self, motion: Trajectory, time: float) -> None:
@@ -72,30 +74,52 @@ class ImposedEnvironment(AmbushEnvironment):
             drawn = self._drawn(motion, noticed_standing=2 * number < DRAWS)
             if drawn is None:
                 continue
-            begins, stands = row_of(time + drawn.begins, drawn.here), row_of(time + drawn.stands, drawn.there)
-            script, made = (row_of(0.0, drawn.here), begins, stands), cube("cube_0", self._edge, drawn.here)
-            self._obstacles = (made.model_copy(update={"trajectory": script, "appears": begins[0]}),)
-            self._moved_again = self.foreseen = stands[0] + self._waits
+            self._coming = _Coming(time + drawn.begins, drawn.here, time + drawn.stands, drawn.there)
             return
 
     def advance(self, time: float, q: Array) -> None:
         """Take the robot's state, shape (dof,), at a time [s].
 
+        A cube whose way is nearer to the robot than ``APART`` when it would set out does not come.
+
         Raises:
             ParameterError: The time is before the last step.
         """
         super().advance(time, q)
-        if time < self._moved_again:
+        q = np.asarray(q, float)
+        if self._coming is not None and time >= self._coming.begins:
+            self._come(self._coming, time, q)
+        if time >= self._moved_again:
+            self._move_again(time, q)
+
+    def _come(self, coming: _Coming, time: float, q: Array) -> None:
+        """Bring the cube in, or never, with the robot at a state, shape (dof,), at a time [s]."""
+        self._coming = None
+        if not self._has_room(coming.here, coming.there, q):
             return
+        later = time - coming.begins
+        begins, stands = row_of(time, coming.here), row_of(coming.stands + later, coming.there)
+        script, made = (row_of(0.0, coming.here), begins, stands), cube("cube_0", self._edge, coming.here)
+        self._obstacles = (made.model_copy(update={"trajectory": script, "appears": time}),)
+        self._moved_again = self.foreseen = stands[0] + self._waits
+
+    def _move_again(self, time: float, q: Array) -> None:
+        """Move the cube once more, with the robot at a state, shape (dof,), at a time [s]."""
         self._moved_again = self.foreseen = math.inf
         (one,) = self._obstacles
         here = place_at(one, time)
-        there = self._next(here, np.asarray(q, float))
+        there = self._next(here, q)
         assert one.trajectory is not None
         lasts = float(np.linalg.norm(there - here)) / self.fastest
         if lasts > 0.0:
             script = (*one.trajectory, row_of(time, here), row_of(time + lasts, there))
             self._obstacles = (one.model_copy(update={"trajectory": script}),)
+
+    def _has_room(self, here: Array, there: Array, q: Array) -> bool:
+        """Whether a cube may move from a place to another, both shape (3,) [m], with the robot at a state."""
+        balls = self._robot.balls(q)
+        places = np.linspace(here, there, 2 + math.ceil(float(np.linalg.norm(there - here)) / STEP))
+        return all(balls.clearance(place, self._edge) >= APART for place in places)
 
     def _drawn(self, motion: Trajectory, noticed_standing: bool) -> _Coming | None:
         """Return how a cube comes that the motion would meet, or None."""
@@ -115,6 +139,8 @@ class ImposedEnvironment(AmbushEnvironment):
             return None
         if not all(self._is_free(there, q, GOAL_CLEARANCE) for q in (*robot.goals, motion.positions[-1])):
             return None
+        if not self._has_room(here, there, motion(begins)):
+            return None
         way = ((t, here + min(t - begins, lasts) * velocity) for t in self._times(begins, noticed))
         if not all(self._is_free(place, motion(t), CLEARANCE) for t, place in way):
             return None
@@ -130,8 +156,7 @@ class ImposedEnvironment(AmbushEnvironment):
 
     def _next(self, here: Array, q: Array) -> Array:
         """Return where a cube that stands here is moved to with the robot at a state, both shape (3,) [m]."""
-        balls = self._robot.balls(q)
-        for _ in range(DRAWS):
+        for _ in range(NEXT):
             angle, length = self._rng.uniform(0.0, 2.0 * np.pi), self._rng.uniform(*WAYS)
             heading = np.array([np.cos(angle), np.sin(angle), 0.0])
             there = here + length * heading
@@ -139,7 +164,6 @@ class ImposedEnvironment(AmbushEnvironment):
                 continue
             if not all(self._is_free(there, goal, GOAL_CLEARANCE) for goal in self._robot.goals):
                 continue
-            places = np.linspace(here, there, 2 + math.ceil(length / STEP))
-            if all(balls.clearance(place, self._edge) >= APART for place in places):
+            if self._has_room(here, there, q):
                 return np.asarray(there)
         return here
