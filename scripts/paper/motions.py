@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from apex_ompl.errors import ApexError
 from apex_ompl.evaluation.rows import Job
 from apex_ompl.evaluation.runs import Run, columns
 from apex_ompl.evaluation.runs import planned as planned_run
-from apex_ompl.ompl.validity import full_check
+from apex_ompl.ompl.validity import FullCheck, full_check
 from apex_ompl.paths.path import path_length
 from apex_ompl.robot import Robot
 from apex_ompl.timing import Timing, Trajectory, time_path
@@ -42,15 +43,36 @@ def followed(path: Array, robot: Robot) -> dict[str, float | None]:
 NO_MOTION: dict[str, float | None] = {"duration": None, "rms_jerk": None}
 
 
+CUBE, ITSELF, LIMITS = "cube", "itself", "limits"
+"""Causes of failures of a path: what it meets first, or that it leaves the limits."""
+
+
+def cause(check: FullCheck, obstacles: Collection[str]) -> str:
+    """Return what a path meets first: an obstacle, or the robot itself and what it holds; empty for a valid path.
+
+    Args:
+        check: The check of the path.
+        obstacles: Names of the obstacles.
+    """
+    if check or check.proof is None:
+        return "" if check else LIMITS
+    return CUBE if set(check.proof.pair) & set(obstacles) else ITSELF
+
+
 def one_sample(job: Job) -> Run:
     """Return the run of one path of a model for a problem: nothing is drawn again where it is invalid."""
     model = job.params["model"]
     ready, control, took = sample(model, job.params["gamma"], job)
     path = load(model).spline.path(control)
-    valid = bool(full_check(ready.checker, path, ready.start, list(ready.goals)))
+    check = full_check(ready.checker, path, ready.start, list(ready.goals))
+    valid = bool(check)
     length = path_length(path) if valid else None
     motion = followed(path, ready.robot) if valid else NO_MOTION
-    return {"solved": valid, "total": took, "length": length, "raw_length": length, "cpu": took, **motion}
+    outcome = cause(check, [obstacle.name for obstacle in ready.problem.scene])
+    return {
+        "solved": valid, "outcome": outcome, "reason": check.reason, "total": took, "length": length,
+        "raw_length": length, "cpu": took, **motion,
+    }  # fmt: skip
 
 
 def timed(job: Job) -> Run:

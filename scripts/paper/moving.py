@@ -40,7 +40,7 @@ from paper.rows import (
     brought,
     installed,
 )  # fmt: skip
-from paper.static import HEAD, cells, errorbars, evenly, measured, of_task, runs_of
+from paper.static import HEAD, errorbars, evenly, measured, of_task, runs_of, with_causes
 from paper.static import median as median_of
 
 from apex_ompl import run
@@ -200,8 +200,7 @@ def told(runs: Sequence[Run]) -> dict[str, Any]:
 
 def told_cells(cell: dict[str, Any]) -> list[str]:
     """Return them as the tables have them, under ``MORE``."""
-    causes = ", ".join(f"{count} {cause}" for cause, count in cell["causes"].items()) or "-"
-    return [*cells(cell), causes, number(cell["time_to_goal_s"]), number(cell["replans"], 1)]
+    return [*with_causes(cell), number(cell["time_to_goal_s"]), number(cell["replans"], 1)]
 
 
 def drawn(sizes: dict[str, Any], labels: Sequence[str]) -> Any:

@@ -143,7 +143,8 @@ def text(results: Results, to: str) -> str:
     seconds, loop = cost_table()["seconds"], LoopSettings()
     return TEMPLATE.read_text("utf-8").format(
         verdict="\n".join(f"{k}. {one}" for k, one in enumerate(verdict.sentences(results), 1)),
-        by_size=verdict.by_size(results), motions=motions(results), entries=entries(results),
+        by_size=verdict.by_size(results), causes=verdict.causes(results),
+        motions=motions(results), entries=entries(results),
         rivals=rivals(results), sweeps=sweeps(results), distances=distances(results),
         pictures=pictures(results, to), made_with=made_with(results, to), trigger=f"{loop.trigger:g}",
         stuck=f"{loop.stuck:g}", limit=f"{LIMIT:g}", timeout=f"{TIMEOUT:g}", patience=f"{PATIENCE:g}",

@@ -41,6 +41,7 @@ SMOOTH = (
     "medians over the solved; the last two are of the motion along the path at "
     f"{PACE:g} of the velocity limits; jerk: root mean square over time",
 )
+CAUSES = ("Causes", "of one sample: what the path meets first, a cube or the robot itself with what it holds")
 Part = tuple[Sequence[str], Sequence[Row]]
 """Levels, and rows that have their numbers of runs on each of them."""
 
@@ -140,7 +141,7 @@ def size(args: Namespace) -> Made:
                 mine = [run for run in results.runs if (run["experiment"], run["label"]) == (level, row.label)]
                 if mine:
                     over[STATIC[level]] = data[f"{level}, {row.label}"] = measured(mine)
-                    lines.append([task, row.label, f"{STATIC[level]:.2f}", *cells(data[f"{level}, {row.label}"])])
+                    lines.append([task, row.label, f"{STATIC[level]:.2f}", *with_causes(over[STATIC[level]])])
             errorbars(axis, over, row.label, 0.0015 * (k - len(rows) / 2))
         axis.set_title(task)
         axis.set_xlabel("edge of the cubes m")
@@ -150,22 +151,34 @@ def size(args: Namespace) -> Made:
             mine = [run for run in of_task(results.runs, BOTH, row.label) if run["experiment"].endswith(f"/{name}")]
             if mine:
                 cell = data[f"{BOTH}/{name}, {row.label}"] = measured(mine)
-                lines.append([BOTH, row.label, f"{STATIC[f'{TASKS[0]}/{name}']:.2f}", *cells(cell)])
+                lines.append([BOTH, row.label, f"{STATIC[f'{TASKS[0]}/{name}']:.2f}", *with_causes(cell)])
             elif untrained(row):
                 data[f"{BOTH}/{name}, {row.label}"] = {"why": "not trained"}
     picture.axes[0].set_ylabel("R_f %")
     picture.legend(*picture.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-    head = ["task", "planner", "edge m", *HEAD]
+    head = ["task", "planner", "edge m", *HEAD, "causes"]
     notes, commits = of_runs(results)
     data["cost"] = cost_of(results)
-    notes.append(SMOOTH)
+    notes += [SMOOTH, CAUSES]
     return Made(data, [Table("Failure ratio over the size of obstacles", head, lines)], notes, picture, commits)
 
 
 def measured(runs: Sequence[Run]) -> dict[str, Any]:
-    """Return failure ratio, and medians of S_r, duration and jerk over the solved, of some runs of a row."""
+    """Return failure ratio, and medians of S_r, duration and jerk over the solved, of some runs of a row.
+
+    With the number of failures by ``causes``, where the runs tell them.
+    """
     columns = {"S_r": "length", "duration_s": "duration", "rms_jerk": "rms_jerk"}
-    return ratio(run["solved"] for run in runs) | {name: median(runs, column) for name, column in columns.items()}
+    found = ratio(run["solved"] for run in runs) | {name: median(runs, column) for name, column in columns.items()}
+    if all("outcome" in run for run in runs):
+        found["causes"] = dict(Counter(run["outcome"] for run in runs if not run["solved"]).most_common())
+    return found
+
+
+def with_causes(cell: Mapping[str, Any]) -> list[str]:
+    """Return what :func:`cells` does, and the causes of failures."""
+    causes = cell.get("causes", {})
+    return [*cells(cell), ", ".join(f"{count} {name}" for name, count in causes.items()) or "-"]
 
 
 def cells(cell: Mapping[str, Any]) -> list[str]:

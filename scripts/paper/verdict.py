@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from math import hypot
 from typing import Any
 
+from paper.figure import ratio
+from paper.motions import CUBE
 from paper.rows import FAITHFUL, MOVED_NO_NETWORK, NO_NETWORK, ONE, OURS, UNGUIDED
 from paper.table import MISSING, Results, Where, dated, shown, table
 
@@ -103,8 +105,11 @@ def guidance(results: Results, scene: Scene) -> str:
     claim = scene.paper[0]
     least, most = guided["interval"]
     beside = "above" if least > claim else "below" if most < claim else "not told apart from"
+    cubes = guided.get("causes", {}).get(CUBE)
+    first = "" if cubes is None else f" ({share(guided, cubes)} % of all meet a cube first)"
+    ratios = f"R_f is {of(guided)} guided{first} and {of(unguided)} unguided"
     return (
-        f"{title}: {says[found]}, R_f is {of(guided)} guided and {of(unguided)} unguided, a difference of {by:.0f} "
+        f"{title}: {says[found]}, {ratios}, a difference of {by:.0f} "
         f"points ({low:.0f} to {high:.0f}); the paper has {claim} and {scene.paper[1]} %, and guided R_f is {beside} "
         "the paper's."
     )
@@ -148,6 +153,26 @@ def of(cell: Cell) -> str:
     """Return a failure ratio with its interval and N."""
     low, high = cell["interval"]
     return f"{cell['R_f']:.1f} % ({low:.1f} to {high:.1f}, N {cell['N']})"
+
+
+def share(cell: Cell, count: int) -> str:
+    """Return the share of a row's runs that ``count`` of them are, with its interval."""
+    part = ratio([False] * count + [True] * (cell["N"] - count))
+    low, high = part["interval"]
+    return f"{part['R_f']:.1f} ({low:.1f} to {high:.1f})"
+
+
+def causes(results: Results) -> str:
+    """Return the table of what samples and runs of the paper's system among the largest cubes fail by."""
+    rows = []
+    for scene in SCENES:
+        for row, how in enumerate(("guided", "unguided")):
+            cell = scene.cell(results, LARGEST, row)
+            if cell is None or "causes" not in cell:
+                continue
+            shares = [f"{name} {share(cell, count)}" for name, count in cell["causes"].items()]
+            rows.append([scene.name, how, shown(cell, "R_f"), f"{cell['N']}{dated(cell)}", "; ".join(shares) or "-"])
+    return table(["largest cubes", "`apex-paper`", "R_f %", "N", "of these by cause (% of N)"], rows)
 
 
 def unmeasured(scene: Scene) -> str:

@@ -6,15 +6,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import binomtest
 from support import ROOT
 
 sys.path += [str(ROOT / "scripts"), str(ROOT)]
 
-from paper import figure, page, table, verdict  # noqa: E402
+from paper import figure, motions, page, table, verdict  # noqa: E402
 
+from apex_ompl.collision.path_proof import PathProof  # noqa: E402
+from apex_ompl.ompl.validity import FullCheck  # noqa: E402
 from apex_ompl.problems.alignment import SIZES  # noqa: E402
 
 
@@ -108,6 +112,27 @@ def test_the_sentence_of_sizes_and_that_of_apex_follow_their_cells() -> None:
     assert len(lines) == 2 + len(verdict.SCENES) * len(SIZES)
     assert "| standing | 6 | 5.0 (" in lines[2] and "| guided is lower |" in lines[2] and "not decided" in lines[6]
     assert lines[7].count(table.MISSING) == 5
+
+
+def test_what_samples_fail_by_has_shares_of_all_runs() -> None:
+    guided = cell(40, 300) | {"causes": {"itself": 23, "cube": 17}}
+    told = Made(standing(guided, cell(290, 300) | {"causes": {"cube": 290}}))
+    first, second = verdict.causes(told).splitlines()[2:]
+    low, high = (100 * end for end in binomtest(17, 300).proportion_ci(method="wilson"))
+    assert f"cube 5.7 ({low:.1f} to {high:.1f})" in first and first.startswith("| standing | guided | 13.3 (")
+    assert "| unguided |" in second and "itself" not in second
+    assert f"5.7 ({low:.1f} to {high:.1f}) % of all meet a cube first)" in verdict.sentences(told)[0]
+    assert verdict.causes(Made(standing(cell(1, 9), cell(1, 9)))).count("\n") == 1, "they did not tell their causes"
+
+
+@pytest.mark.parametrize(
+    "ok, pair, said",
+    [(True, ("cube_0", "palm"), ""), (False, None, "limits"), (False, ("palm", "cube_0"), "cube"),
+     (False, ("cube_1", "palm"), "itself")],
+)  # fmt: skip
+def test_a_sample_fails_by_what_it_meets_first(ok: bool, pair: tuple[str, str] | None, said: str) -> None:
+    proof = None if pair is None else PathProof(ok, "", 0.0, np.zeros(1), 0.0, 0.0, pair, 0.0, 1)
+    assert motions.cause(FullCheck(ok, "", 0, proof), ["cube_0"]) == said
 
 
 def test_what_was_never_trained_is_said() -> None:
