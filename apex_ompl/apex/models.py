@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 
@@ -72,6 +73,12 @@ Model = TrajectoryModel | PerturbationModel
 """A model of proposals."""
 
 
+@cache
+def _perturbations() -> PerturbationModel:
+    """Return the one of this process: it keeps nothing."""
+    return PerturbationModel()
+
+
 def trajectory_model(name: str, robot: Robot, device: str = "cpu") -> Model:
     """Return a checkpoint's model for a robot, or random perturbations.
 
@@ -86,7 +93,7 @@ def trajectory_model(name: str, robot: Robot, device: str = "cpu") -> Model:
     """
     name = find_model(robot).name if name == AUTO else name
     if name == NONE:
-        return PerturbationModel()
+        return _perturbations()
     fault = robot_fault(name, robot)
     if fault is not None:
         raise fault

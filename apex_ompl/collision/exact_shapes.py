@@ -238,16 +238,21 @@ def shape_arrays(placed: Sequence[PlacedShape]) -> ShapeArrays:
     )
 
 
-def joined(bodies: ShapeArrays, obstacles: ShapeArrays) -> ShapeArrays:
-    """Return the shapes of bodies, followed by those of obstacles."""
+def joined(bodies: ShapeArrays, others: ShapeArrays) -> ShapeArrays:
+    """Return the shapes of bodies, followed by others."""
+    pairs = zip(bodies, placed_after(bodies, others), strict=True)
+    return ShapeArrays(*(np.concatenate(pair) for pair in pairs))
+
+
+def placed_after(bodies: ShapeArrays, others: ShapeArrays) -> ShapeArrays:
+    """Return shapes whose points, nodes and edges have the places that they get after those of bodies."""
     points, nodes, edges = len(bodies.points), len(bodies.child), len(bodies.edge_end)
-    moved = obstacles._replace(
-        points_of=obstacles.points_of + np.array([points, 0], np.int64), root=_moved(obstacles.root, nodes),
-        child=_moved(obstacles.child, nodes), graph=_moved(obstacles.graph, len(bodies.edge_first)),
-        edge_first=obstacles.edge_first + edges,
-        corner=np.where(obstacles.corner <= POINT, obstacles.corner - points, _moved(obstacles.corner, points)),
+    return others._replace(
+        points_of=others.points_of + np.array([points, 0], np.int64), root=_moved(others.root, nodes),
+        child=_moved(others.child, nodes), graph=_moved(others.graph, len(bodies.edge_first)),
+        edge_first=others.edge_first + edges,
+        corner=np.where(others.corner <= POINT, others.corner - points, _moved(others.corner, points)),
     )  # fmt: skip
-    return ShapeArrays(*(np.concatenate(pair) for pair in zip(bodies, moved, strict=True)))
 
 
 def rearranged(shapes: ShapeArrays, order: Sequence[int]) -> ShapeArrays:

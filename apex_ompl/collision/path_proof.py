@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from apex_ompl.collision.exact_shapes import PlacedShape, joined, rearranged, shape_arrays
+from apex_ompl.collision.exact_shapes import PlacedShape, joined, placed_after, rearranged, shape_arrays
 from apex_ompl.collision.mesh_stage import MeshStage
 from apex_ompl.collision.solids import Solid
 from apex_ompl.collision.tables import joint_tree, stored_shapes
@@ -163,7 +163,9 @@ def _shapes_of_bodies(robot: Robot, scene: MeshStage, kernel: Kernel) -> ShapeAr
 def _pack(bodies: ShapeArrays, obstacles: list[PlacedShape]) -> tuple[Integers, Floats]:
     """Return the packed shapes of bodies and obstacles; those of the last scenes are kept."""
     key = id(bodies), tuple((id(shape.geometry), shape.pose.tobytes()) for shape in obstacles)
-    found = _packed.pop(key, None) or (bodies, obstacles, pack(joined(bodies, shape_arrays(obstacles))))
+    found = _packed.pop(key, None)
+    if found is None:
+        found = bodies, obstacles, pack(bodies, placed_after(bodies, shape_arrays(obstacles)))
     _packed[key] = found
     while len(_packed) > MOST_SCENES:
         _packed.pop(next(iter(_packed), key), None)

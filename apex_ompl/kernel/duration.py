@@ -8,14 +8,12 @@ import numpy as np
 
 from apex_ompl.kernel.compiled.layout import Integers
 from apex_ompl.kernel.compiled.timing import duration_optimization as compiled
-from apex_ompl.kernel.compiled.timing.duration_optimization import DurationSettings
+from apex_ompl.kernel.compiled.timing.duration_problem import WIDTH, DurationSettings, duration_buffer_sizes
 from apex_ompl.kernel.kernel import Kernel
 from apex_ompl.kernel.products import product
 from apex_ompl.types import Array
 
 __all__ = ["DurationReport", "DurationSettings", "TimeGrid", "lower_duration"]
-
-WIDTH = compiled.WIDTH
 
 
 class TimeGrid(NamedTuple):
@@ -67,7 +65,7 @@ class DurationReport(NamedTuple):
 
 def duration_buffers(grid: TimeGrid, control: Array, pinned: int) -> tuple[Integers, Array]:
     """Return memory for the steps on control points, shape (P, dof), of which some are pinned at each end."""
-    integers, floats = compiled.duration_buffer_sizes(len(control), pinned, control.shape[1], len(grid.weights))
+    integers, floats = duration_buffer_sizes(len(control), pinned, control.shape[1], len(grid.weights))
     return np.empty(integers, np.int64), np.empty(floats)
 
 

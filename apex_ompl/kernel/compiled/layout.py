@@ -59,22 +59,24 @@ def layout(cls: Any) -> tuple[Field, ...]:
     return tuple(found)
 
 
-def pack(arrays: Any) -> tuple[Any, ...]:
+def pack(table: Any, *more: Any) -> tuple[Any, ...]:
     """Return the arrays of a table one after the other: integers and floats, and singles where there are any.
 
-    The integers start with the first and last place of every field, see :func:`table_view`.
+    The integers start with the first and last place of every field, see :func:`table_view`. Of several tables of one
+    kind, without singles, each field is that of the first followed by those of the others.
     """
-    fields = layout(arrays.__class__)
     places: list[int] = []
     parts: dict[bool, list[NDArray[Any]]] = {True: [], False: []}
+    fields = layout(table.__class__)
     ends = {True: 2 * sum(not field.single for field in fields), False: 0}
-    for field, array in zip(fields, arrays, strict=True):
+    for field, *arrays in zip(fields, table, *more, strict=True):
         if field.single:
             continue
-        places += [ends[field.integer], ends[field.integer] + array.size]
-        ends[field.integer] += array.size
-        parts[field.integer].append(array.ravel())
-    singles = (array for field, array in zip(fields, arrays, strict=True) if field.single)
+        places.append(ends[field.integer])
+        ends[field.integer] += sum(array.size for array in arrays)
+        places.append(ends[field.integer])
+        parts[field.integer] += [array.ravel() for array in arrays]
+    singles = (array for field, array in zip(fields, table, strict=True) if field.single)
     return np.concatenate([np.array(places, np.int64), *parts[True]]), np.concatenate(parts[False]), *singles
 
 

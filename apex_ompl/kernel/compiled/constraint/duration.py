@@ -13,7 +13,8 @@ from apex_ompl.kernel.compiled.compilation import reassociating_entry_point, rea
 from apex_ompl.kernel.compiled.constraint.projection import rows_view
 from apex_ompl.kernel.compiled.constraint.rows import ConstraintArrays, RowBuffers, constraints_view, set_rows
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.timing.duration_optimization import (
+from apex_ompl.kernel.compiled.timing.duration_optimization import descend
+from apex_ompl.kernel.compiled.timing.duration_problem import (
     ROWS_PER_SAMPLE,
     WIDTH,
     Buffers,
@@ -21,7 +22,6 @@ from apex_ompl.kernel.compiled.timing.duration_optimization import (
     Numbers,
     Problem,
     buffers_view,
-    descend,
 )
 from apex_ompl.kernel.compiled.workspace import Workspace, workspace_view
 
