@@ -23,6 +23,7 @@ from apex_ompl.loop.control import RunRecord
 from apex_ompl.loop.cycle import Cycle
 from apex_ompl.loop.environment import LiveSensor, Observation
 from apex_ompl.loop.loop import Command, Loop
+from apex_ompl.loop.referee import NEAR_GOAL
 from apex_ompl.loop.result import INTERRUPTED
 from apex_ompl.moving.context import SAME_TIME
 from apex_ompl.robot.model import Robot
@@ -123,12 +124,22 @@ class DrivenRun:
                     self.loop.end("the clock of the driver stands still")
         record, end = self.loop.record, self.loop.record.trajectory.duration
         self._wait(end)
-        patience = time.monotonic() + self.cycle.context.settings.silence
-        while not self.simulated and self.times and self.times[-1] < end and time.monotonic() < patience:
-            time.sleep(POLL)  # states arrive later than they were measured
-            self._measured(self.driver.time - self.zero)
+        self._settle(record.trajectory)
         self.cycle.advance(max(end, self._last), self.positions[-1] if self.positions else None)
         return replace(record, measured={**record.measured, **self._figures(record.trajectory)})
+
+    def _settle(self, commanded: Trajectory) -> None:
+        """Wait until the robot is measured where the commands end, no longer than for a state that does not come.
+
+        States arrive later than they were measured, and a robot lags behind its commands.
+        """
+        patience = time.monotonic() + self.cycle.context.settings.silence
+        while not self.simulated and self.times and time.monotonic() < patience:
+            off = np.abs(self.positions[-1] - commanded.positions[-1]).max()
+            if self.times[-1] >= commanded.duration and off <= NEAR_GOAL:
+                break
+            time.sleep(POLL)
+            self._measured(self.driver.time - self.zero)
 
     def executed(self) -> Trajectory | None:
         """Return the measured motion, a cubic spline through its states, or None where there are less than two.

@@ -13,7 +13,7 @@ from support import benchmark_script
 
 from apex_ompl import LoopSettings, Obstacle, problems, run
 from apex_ompl.api import load_environment
-from apex_ompl.drivers import KinematicDriver
+from apex_ompl.drivers import DriverState, KinematicDriver
 from apex_ompl.errors import ApexError, ParameterError
 from apex_ompl.loop import Observation
 from apex_ompl.loop.driven import DrivenRun, LiveStream
@@ -74,6 +74,28 @@ def test_a_driver_on_the_wall_clock_is_followed() -> None:
     assert found.outcome in (Outcome.REACHED, Outcome.TIMEOUT) and found.clock == "real"
     assert np.abs(driver.state().velocities).max() == 0.0
     assert np.abs(driver.state().positions - found.trajectory.positions[-1]).max() < 1e-9
+
+
+class Lagging(KinematicDriver):
+    """Is where the commands had it some time ago."""
+
+    lag = 0.4  # [s]
+
+    def state(self) -> DriverState:
+        now = super().state()
+        self.past = [*getattr(self, "past", []), (time.monotonic(), now.positions)]
+        old = [positions for at, positions in self.past if at <= time.monotonic() - self.lag]
+        return replace(now, positions=old[-1] if old else self.past[0][1])
+
+
+def test_a_robot_that_lags_behind_its_commands_is_judged_where_it_comes_to_rest() -> None:
+    driver = Lagging(robot(), exact().state().positions, clock=time.monotonic)
+    limits = replace(SETTINGS, timeout=10.0)
+    found = run(
+        problems.load(PROBLEM), ByHand(line), clock="real", settings=limits, sensor=Camera(), driver=driver,
+        tolerance=3.0,
+    )  # fmt: skip
+    assert found.outcome is Outcome.REACHED and found.metrics["tracking_error"] > 0.1
 
 
 def test_the_motion_that_was_measured_is_judged() -> None:
