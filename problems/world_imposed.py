@@ -28,7 +28,7 @@ from apex_ompl.timing import Trajectory
 from apex_ompl.types import Array
 
 DRAWS = 1000  # of a cube
-NEXT = 200  # places to which one that is moved again may go that are looked at
+AGAIN_DRAWS = 200  # of where one that is moved again goes
 SHARES = (0.05, 0.4)  # of the first motion's length, at which the cube comes into view
 COMING = (0.3, 1.0)  # for which it comes [s]
 NOTICE = 0.5  # after it stands, or after it comes into view where no draw leaves that, before the motion meets it [s]
@@ -156,7 +156,7 @@ class ImposedEnvironment(AmbushEnvironment):
 
     def _next(self, here: Array, q: Array) -> Array:
         """Return where a cube that stands here is moved to with the robot at a state, both shape (3,) [m]."""
-        for _ in range(NEXT):
+        for _ in range(AGAIN_DRAWS):
             angle, length = self._rng.uniform(0.0, 2.0 * np.pi), self._rng.uniform(*WAYS)
             heading = np.array([np.cos(angle), np.sin(angle), 0.0])
             there = here + length * heading

@@ -124,19 +124,22 @@ class DrivenRun:
                     self.loop.end("the clock of the driver stands still")
         record, end = self.loop.record, self.loop.record.trajectory.duration
         self._wait(end)
-        self._settle(record.trajectory)
-        self.cycle.advance(max(end, self._last), self.positions[-1] if self.positions else None)
+        self._settle(record)
+        last = max(end, self._last, *self.times[-1:])
+        self.cycle.advance(last, self.positions[-1] if self.positions else None)
         return replace(record, measured={**record.measured, **self._figures(record.trajectory)})
 
-    def _settle(self, commanded: Trajectory) -> None:
-        """Wait until the robot is measured where the commands end, no longer than for a state that does not come.
+    def _settle(self, record: RunRecord) -> None:
+        """Wait for the state at the end of the commands, and for a robot that reached a goal to be there.
 
-        States arrive later than they were measured, and a robot lags behind its commands.
+        States arrive later than they were measured, and a robot follows its commands late. What does not come for
+        ``silence`` is not waited for.
         """
+        end, goal = record.trajectory.duration, record.trajectory.positions[-1]
         patience = time.monotonic() + self.cycle.context.settings.silence
         while not self.simulated and self.times and time.monotonic() < patience:
-            off = np.abs(self.positions[-1] - commanded.positions[-1]).max()
-            if self.times[-1] >= commanded.duration and off <= NEAR_GOAL:
+            there = not record.reached or np.abs(self.positions[-1] - goal).max() <= NEAR_GOAL
+            if self.times[-1] >= end and there:
                 break
             time.sleep(POLL)
             self._measured(self.driver.time - self.zero)

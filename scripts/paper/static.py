@@ -28,7 +28,7 @@ from apex_ompl import planners
 from apex_ompl.evaluation import Results, Row, Workers, bench
 from apex_ompl.evaluation.metrics import next_percentile
 from apex_ompl.evaluation.rows import jobs as jobs_of
-from apex_ompl.evaluation.runs import NO_PROBLEM, Run
+from apex_ompl.evaluation.runs import CRASH, NO_PROBLEM, Run
 from apex_ompl.evaluation.summary import Table
 from benchmarks.lib import record
 
@@ -170,8 +170,9 @@ def measured(runs: Sequence[Run]) -> dict[str, Any]:
     """
     columns = {"S_r": "length", "duration_s": "duration", "rms_jerk": "rms_jerk"}
     found = ratio(run["solved"] for run in runs) | {name: median(runs, column) for name, column in columns.items()}
-    if all("outcome" in run for run in runs):
-        found["causes"] = dict(Counter(run["outcome"] for run in runs if not run["solved"]).most_common())
+    if all("outcome" in run or run["status"] == CRASH for run in runs):
+        failed = Counter(run.get("outcome", "crash") for run in runs if not run["solved"])
+        found["causes"] = dict(failed.most_common())
     return found
 
 

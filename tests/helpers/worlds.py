@@ -5,9 +5,12 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from hypothesis import settings
+from hypothesis import strategies as st
 
 from apex_ompl import problems
 from apex_ompl.collision import CollisionChecker
+from apex_ompl.problems.alignment import SIZES
 from apex_ompl.problems.suite_robot import robot
 from apex_ompl.problems.worlds import DynamicEnvironment
 from apex_ompl.scene.bodies import Obstacle
@@ -16,6 +19,13 @@ from apex_ompl.timing import Timing, Trajectory, time_path
 from apex_ompl.types import Array
 
 STEP, BEGIN = 0.01, 0.25  # of the clock, and when the first motion begins [s]
+seeds = st.integers(0, 999)
+sizes, suites, paces = (
+    st.sampled_from(sorted(SIZES)),
+    st.sampled_from(["vertical", "horizontal"]),
+    st.sampled_from([0.25, 1.0]),
+)
+several = settings(max_examples=8)
 
 
 @cache

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given
 
 from apex_ompl.errors import ParameterError
 from apex_ompl.problems import worlds
@@ -15,15 +14,20 @@ from apex_ompl.problems.world_ambushes import moment_of
 from apex_ompl.problems.world_robot import RobotPlaces, cube
 from apex_ompl.scene.scripts import place_at
 from apex_ompl.timing import Trajectory
-from tests.helpers.worlds import BEGIN, STEP, check_consistency, exact, first_motion, run, state
-
-seeds = st.integers(0, 999)
-sizes, suites, paces = (
-    st.sampled_from(sorted(SIZES)),
-    st.sampled_from(["vertical", "horizontal"]),
-    st.sampled_from([0.25, 1.0]),
+from tests.helpers.worlds import (
+    BEGIN,
+    STEP,
+    check_consistency,
+    exact,
+    first_motion,
+    paces,
+    run,
+    seeds,
+    several,
+    sizes,
+    state,
+    suites,
 )
-several = settings(max_examples=8)
 
 
 @pytest.mark.parametrize("kind", ["popup", "imposed", "interceptor", "pusher"])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from apex_ompl import problems
@@ -21,16 +21,20 @@ from apex_ompl.scene.bodies import Obstacle
 from apex_ompl.scene.problem import Problem
 from apex_ompl.scene.scripts import obstacle_at, place_at
 from apex_ompl.timing import Timing, time_path
-from tests.helpers.worlds import check_consistency, exact, first_motion, run, straight
+from tests.helpers.worlds import (
+    check_consistency,
+    exact,
+    first_motion,
+    paces,
+    run,
+    seeds,
+    several,
+    sizes,
+    straight,
+    suites,
+)
 
 BASES, BASE_REACH = COLUMNS[0], COLUMNS[1][0, 0]
-seeds = st.integers(0, 999)
-sizes, suites, paces = (
-    st.sampled_from(sorted(SIZES)),
-    st.sampled_from(["vertical", "horizontal"]),
-    st.sampled_from([0.25, 1.0]),
-)
-several = settings(max_examples=8)
 
 
 @several

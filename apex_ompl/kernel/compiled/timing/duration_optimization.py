@@ -30,7 +30,6 @@ from typing import NamedTuple
 from apex_ompl.kernel.compiled.arrays import RobotArrays, SceneArrays, robot_view, scene_view
 from apex_ompl.kernel.compiled.compilation import reassociating_entry_point, reassociating_inlined
 from apex_ompl.kernel.compiled.layout import Floats, Integers, Singles
-from apex_ompl.kernel.compiled.timing.band_factor import factorize, solve_factor, solve_transposed
 from apex_ompl.kernel.compiled.timing.duration_problem import (
     LEAST_BOUND_SLACK,
     LEAST_SLACK,
@@ -71,12 +70,57 @@ def _no_penalty(penalty: NoPenalty, t: RobotArrays, w: Workspace, q: Floats, b: 
 
 
 @reassociating_inlined
+def _factorize(gram: Floats) -> bool:
+    """Replace the band of a matrix by that of its upper Cholesky factor."""
+    n, band = gram.shape
+    for k in range(n):
+        row = gram[k]
+        if not row[0] > 0.0:
+            return False
+        root = 1.0 / math.sqrt(row[0])
+        for j in range(band):
+            row[j] *= root
+        for m in range(1, min(band, n - k)):
+            f = row[m]
+            if f == 0.0:
+                continue
+            target, source = gram[k + m, : band - m], row[m:]
+            for j in range(len(target)):
+                target[j] -= f * source[j]
+    return True
+
+
+@reassociating_inlined
+def _solve_transposed(factor: Floats, x: Floats) -> None:
+    """Multiply by the inverse of the transpose of a factor of :func:`_factorize` in place."""
+    n, band = factor.shape
+    for k in range(n):
+        x[k] /= factor[k, 0]
+        f, most = x[k], min(band, n - k)
+        row, rest = factor[k, 1:most], x[k + 1 : k + most]
+        for j in range(len(rest)):
+            rest[j] -= f * row[j]
+
+
+@reassociating_inlined
+def _solve_factor(factor: Floats, x: Floats) -> None:
+    """Multiply by the inverse of a factor of :func:`_factorize` in place."""
+    n, band = factor.shape
+    for k in range(n - 1, -1, -1):
+        total, most = x[k], min(band, n - k)
+        row, rest = factor[k, 1:most], x[k + 1 : k + most]
+        for j in range(len(rest)):
+            total -= row[j] * rest[j]
+        x[k] = total / factor[k, 0]
+
+
+@reassociating_inlined
 def _newton_step(corner: float, slope: float, hurry: float, b: Buffers) -> float:
     """Solve for the step of the control points, in place of the gradient, and of u, which is returned."""
     for j in range(len(b.gradient)):
         b.gradient[j] = -b.gradient[j]
-    solve_transposed(b.gram, b.gradient)
-    solve_transposed(b.gram, b.border)
+    _solve_transposed(b.gram, b.gradient)
+    _solve_transposed(b.gram, b.border)
     product, square = 0.0, 0.0
     for j in range(len(b.gradient)):
         product += b.border[j] * b.gradient[j]
@@ -84,7 +128,7 @@ def _newton_step(corner: float, slope: float, hurry: float, b: Buffers) -> float
     change = (-slope - product) / (corner - square) if hurry > 0.0 else 0.0
     for j in range(len(b.gradient)):
         b.gradient[j] -= change * b.border[j]
-    solve_factor(b.gram, b.gradient)
+    _solve_factor(b.gram, b.gradient)
     return change
 
 
@@ -277,7 +321,7 @@ def descend(
         corner, slope = add_limits(p, control, u, mu, settings, b)
         add_bounds(t, p, control, mu, b)
         worst = add_clearances(t, s, w, p, control, settings, mu, now, ends, b, penalize, penalty)
-        if worst == -math.inf or not factorize(b.gram):
+        if worst == -math.inf or not _factorize(b.gram):
             break
         du = _newton_step(corner, slope, settings.hurry, b)
         primal, dual = _longest_steps(t, p, control, u, du, mu, now, settings.largest, b)
